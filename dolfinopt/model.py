@@ -68,7 +68,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.budget import Budget
     from dolfinopt.dynamics.state_space import StateSpace
     from dolfinopt.part.check import Check
-    from dolfinopt.part.part import Part
+    from dolfinopt.part.part import Curves, Part
     from dolfinopt.study.studies import Preset
 
 Densities = Mapping[str, np.ndarray]
@@ -559,11 +559,11 @@ class Model:
             ConvergenceError: the motion of the densities or of the parts cannot be simulated.
         """
         from dolfinopt.part.check import check_parts
-        from dolfinopt.part.part import Curves, make_parts, mesh_parts
+        from dolfinopt.part.part import make_parts, mesh_parts
 
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")
-            parts = make_parts(self.scene, place, Curves(tool_radius, tolerance), self._world)
+            parts = make_parts(self.scene, place, self._curves(tool_radius, tolerance), self._world)
             with together(self._world):
                 if self._world.rank == 0:
                     return check_parts(self.scene, place, parts, mesh_parts(parts))
@@ -576,17 +576,18 @@ class Model:
         *,
         tool_radius: float | None = None,
         tolerance: float | None = None,
-        arcs: bool = False,
+        optimize: bool | None = None,
     ) -> dict[str, Part]:
         """Make parts for the workshop of a design, as `dolfinopt part` does.
 
         Args:
             x: a result or its design.
             folder: for the files of `dolfinopt part`, but for the picture; None: none are written.
-            tool_radius: of concave corners, m; None: a fifth of a cell. Like the next two, of
+            tool_radius: least of concave corners, m; None: the scene's, or 3 mm. Like the next, of
                 solids for those alone whose design is the same over the thickness.
-            tolerance: of the curves, m; None: 0.1 mm or a tenth of a cell, the smaller.
-            arcs: lines and arcs alone, no splines.
+            tolerance: how far sides may lie from the densities' outline, m; None: the scene's, or
+                half a cell.
+            optimize: whether to optimise the parts' shape; None: as the scene's [part] says.
 
         Returns:
             The parts by the names of the arms with a design of their own; empty but on rank 0.
@@ -596,7 +597,8 @@ class Model:
         """
         from dolfinopt.output.folders import check_sources, check_unused, prepare_folder
         from dolfinopt.part.folder import file_names, write_parts
-        from dolfinopt.part.part import Curves, make_parts, mesh_parts
+        from dolfinopt.part.optimize import optimize_parts
+        from dolfinopt.part.part import make_parts, mesh_parts
 
         self.scene.check_designed()
         out = None if folder is None else Path(folder)
@@ -605,15 +607,27 @@ class Model:
             on_root(self._world, check_unused, out, file_names(self.scene))
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")
-            curves = Curves(tool_radius, tolerance, arcs)
+            curves = self._curves(tool_radius, tolerance)
             found = make_parts(self.scene, place, curves, self._world)
-        if out is not None:
-            with together(self._world):
-                if self._world.rank == 0:
+        asked = self.scene.part
+        with together(self._world):
+            if self._world.rank == 0:
+                if asked.optimize if optimize is None else optimize:
+                    given = self.scene, found, asked.iterations, lambda _: None, asked.starts
+                    found = optimize_parts(*given).best.parts
+                if out is not None:
                     prepare_folder(out)
                     meshes = mesh_parts(found, coarse=False).fine
                     write_parts(out, self.scene, found, meshes)
         return {self.scene.arms[k].name: part for k, part in found.items()}
+
+    def _curves(self, tool_radius: float | None, tolerance: float | None) -> Curves:
+        """Return what is asked of the parts' curves, by the scene where nothing else is."""
+        from dolfinopt.part.part import Curves
+
+        asked = self.scene.part
+        tool = asked.tool_radius if tool_radius is None else tool_radius
+        return Curves(tool, asked.tolerance if tolerance is None else tolerance)
 
     def study(
         self,

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.scene import Origin, RobotScene
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
     from dolfinopt.parallel import Partition
-    from dolfinopt.part.part import Part
     from dolfinopt.scene.load import Scene
     from dolfinopt.study.tables import Table
 
@@ -446,7 +445,6 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
     """
     world = start()
     from dolfinopt.parallel import on_root, together
-    from dolfinopt.part.part import make_parts
 
     scene: Scene = on_root(world, scene_of, run)
     origin = on_root(world, _origin_of, scene, run)
@@ -456,12 +454,12 @@ def export_robot(run: Path, out: Path | None, overwrite: bool, before: Path | No
     on_root(world, _check_robot, origin.file, folder, names)
     claim(world, folder, overwrite, [*names, *PAGES])
     after = _reduced(world, run, scene)
-    parts = make_parts(scene, run, world=world)
+    links = _links(world, after)
     sides = [] if before is None else _sides(world, before, after)
     with together(world):
         if world.rank == 0:
             with ending_at_once():
-                files, said = _robot_files(scene, origin, folder, after.bodies, parts)
+                files, said = _robot_files(scene, origin, folder, links)
                 if table is not None:
                     files = _pages(table, sides) | files
                     said.append(table.markdown())
@@ -484,13 +482,57 @@ def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
             )
 
 
-def _reduced(world: MPI.Comm, run: Path, scene: Scene) -> _Run:
-    """Return a finished run's arms, reduced (collective)."""
+# Body and surface, (n, 3, 3) m, of arms by their names, on the root.
+_Links = Mapping[str, tuple["ShapeIntegrals", "np.ndarray"]]
+
+
+def _links(world: MPI.Comm, run: _Run) -> _Links:
+    """Return the links of a run: the parts that `dolfinopt part` made, or parts of its design."""
+    from dolfinopt.loading import load_scene
+    from dolfinopt.output.folders import PARTS, stale_parts
+    from dolfinopt.parallel import on_root
+    from dolfinopt.part.folder import SCENE
+    from dolfinopt.part.part import make_parts
+
+    made = run.folder / PARTS
+    if not on_root(world, lambda: (made / SCENE).is_file() and not stale_parts(made)):
+        parts = make_parts(run.scene, run.folder, world=world)
+        owners = dict(zip((arm.name for arm in run.scene.arms), run.scene.owners, strict=True))
+        return {name: (run.bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
+    machine: Scene = on_root(world, load_scene, made / SCENE)
+    bodies = _reduced(world, made, machine, None).bodies
+    if world.rank:
+        return {}
+    files = {one.name: made / f"{_owner(run.scene, one.name)}.stl" for one in machine.arms}
+    return {
+        one.name: (bodies[k], _surface(files[one.name]))
+        for k, one in enumerate(machine.arms)
+        if k in bodies and files[one.name].is_file()
+    }
+
+
+def _owner(scene: Scene, name: str) -> str:
+    """Return the name of the arm whose design an arm has."""
+    owner = scene.owners[[arm.name for arm in scene.arms].index(name)]
+    return name if owner is None else scene.arms[owner].name
+
+
+def _surface(file: Path) -> np.ndarray:
+    """Return the triangles (n, 3, 3) of a binary STL file in millimetres, m."""
+    import numpy as np
+
+    row = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
+    return 1e-3 * np.fromfile(file, row, offset=84)["corners"].astype(float)
+
+
+def _reduced(world: MPI.Comm, run: Path, scene: Scene, design: str | None = "design.npz") -> _Run:
+    """Return a finished run's arms, reduced (collective); without a design solid ones."""
     from dolfinopt.output.design import arms_with_design
     from dolfinopt.parallel import gather_arms, together
     from dolfinopt.profiling import Profile
 
-    partition, arms, x_phys = arms_with_design(world, scene, run / "design.npz", Profile())
+    densities = None if design is None else run / design
+    partition, arms, x_phys = arms_with_design(world, scene, densities, Profile())
     with together(world):
         mine = {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}
     own = {k: x_phys[k] for k in arms}
@@ -565,8 +607,7 @@ def _robot_files(
     scene: Scene,
     origin: Origin,
     folder: Path,
-    bodies: Mapping[int, ShapeIntegrals],
-    parts: Mapping[int, Part],
+    now: _Links,
 ) -> tuple[dict[str, bytes], list[str]]:
     """Return the files by name, the robot last, and what has become of the links (root only)."""
     from dolfinopt.exchange.urdf.file import NewLink, read_robot, robot_text
@@ -576,13 +617,13 @@ def _robot_files(
     links, index = [], {arm.name: k for k, arm in enumerate(scene.arms)}
     files, said = {}, []
     for name, link in origin.links.items():
-        owner = scene.owners[index[name]] if name in index else None
-        if owner is None or link not in before:
+        if name not in now or link not in before:
             warn([f"{name}: no solid arm of this scene, or no link {link!r}: it stays as it is"])
             continue
         frame, mesh = origin.frames[name], f"{name}.stl"
-        inertia = link_inertia(scene, index[name], bodies[owner]).posed(frame)
-        facets = parts[owner].facets @ frame[:3, :3].T + frame[:3, 3]
+        body, surface = now[name]
+        inertia = link_inertia(scene, index[name], body).posed(frame)
+        facets = surface @ frame[:3, :3].T + frame[:3, 3]
         files[mesh] = triangle_bytes(facets, f"{name}, m")
         links.append(NewLink(link, inertia, mesh))
         said.append(f"{link}: {inertia.mass:.4g} kg, was {before[link].own.mass:.4g} kg")

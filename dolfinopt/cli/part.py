@@ -42,17 +42,17 @@ Say = Callable[[str], None]
 @click.argument("folder", metavar="DIR", type=PATH)
 @out_option("the files; default: DIR/part")
 @click.option(
-    "--tool-radius", type=float, metavar="M", help="of concave corners; default: a fifth of a cell"
+    "--tool-radius", type=float, metavar="M", help="least of concave corners; default: 0.003"
 )
 @click.option(
     "--tolerance",
     type=float,
     metavar="M",
-    help="largest distance of the curves from the outline; default: 0.1 mm or a tenth of a cell, "
-    "the smaller",
+    help="how far sides may lie from the outline of the densities; default: half a cell",
 )
-@click.option("--curves", type=click.Choice(["splines", "arcs"]), hidden=True)  # part.curves
-@click.option("--simplify/--no-simplify", default=None, hidden=True)
+@click.option("--curves", type=click.Choice(["splines", "arcs"]), hidden=True)  # no effect
+@click.option("--simplify/--no-simplify", default=None, hidden=True)  # no effect
+@click.option("--round", "rounds", is_flag=True, help="radii of whole half millimetres")
 @click.option(
     "--check/--no-check",
     default=True,
@@ -81,6 +81,7 @@ def part(
     tolerance: float | None,
     curves: str | None,
     simplify: bool | None,
+    rounds: bool,
     check: bool,
     optimize: bool | None,
     iterations: int | None,
@@ -97,7 +98,7 @@ def part(
     tells what it does beside the densities, and beside these cut to solid and void.
 
     Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness as
-    STEP and DXF, too, for which --tool-radius and --tolerance are.
+    STEP and DXF, too, for which --tool-radius, --tolerance and --round are.
 
     Options go over the table [part] of the scene: "dolfinopt keys part" lists its keys.
     """
@@ -117,8 +118,8 @@ def part(
              "simplify": simplify, "optimize": optimize, "iterations": iterations,
              "starts": starts}  # fmt: skip
     asked = scene.part.unchecked_copy({k: v for k, v in given.items() if v is not None})
-    if asked.optimize and asked.curves == "arcs":  # at once: outlines and meshes take a while
-        raise InputError("--optimize: expected splines, not --curves arcs")
+    if world.rank == 0 and (asked.curves != "splines" or asked.simplify):
+        warn(["part.curves and part.simplify have no effect: parts have lines, arcs and circles"])
     if resume and not asked.optimize:
         raise InputError("--resume: goes on with --optimize, which is not asked for")
     names = [*file_names(scene), SHAPES]
@@ -127,9 +128,7 @@ def part(
     known = on_root(world, kept.read) if resume else ()
     with _stages(world) as say:
         say("outlines and surfaces")
-        # Splines are optimised, then simplified.
-        simple = asked.simplify and not asked.optimize
-        wanted = Curves(asked.tool_radius, asked.tolerance, asked.curves == "arcs", simple)
+        wanted = Curves(asked.tool_radius, asked.tolerance, rounds)
         try:
             parts = make_parts(scene, folder, wanted, world)
         except PartsError as error:  # what there is of the others is of use
@@ -146,14 +145,14 @@ def part(
                 made = made.checked(folder, say) if check else made
                 if asked.optimize and made.meshes is not None:
                     made = made.optimized(folder, asked, check, say, kept.replace, known)
-                    if asked.simplify:
-                        made = made.simplified(folder, asked.tolerance, check, say)
                 say("files")
                 made.write(folder, target, plots)
                 if made.shape is None or not made.shape.interrupted:
                     kept.remove()
     if world.rank == 0:
         made.tell(target)
+        if made.meshes is None:
+            raise ConvergenceError("a part cannot be meshed: there is no part.toml")
         if made.shape is not None and made.shape.interrupted:
             raise KeyboardInterrupt(
                 f"the best parts so far are in {target}; to go on, add --resume"
@@ -220,13 +219,17 @@ class Made:
     shape: Optimized | None = None
 
     def checked(self, run: Path, say: Say) -> Made:
-        """Return it with what the parts do, or a warning where that cannot be simulated."""
+        """Return it with what the parts do, or a warning where that cannot be simulated.
+
+        What is known is of the parts before, which stand beside these.
+        """
         from dolfinopt.part.check import check_parts
 
         if self.meshes is None:
             return self
         try:
-            return replace(self, check=check_parts(self.scene, run, self.parts, self.meshes, say))
+            given = self.scene, run, self.parts, self.meshes, say, self.check
+            return replace(self, check=check_parts(*given))
         except ConvergenceError as error:
             warn([f"the machine with the parts cannot be compared: {error}"])
             return replace(self, check=None)
@@ -243,31 +246,11 @@ class Made:
         say("shapes")
         with _ended_as_interrupted():
             given = self.scene, self.parts, asked.iterations, tell, asked.starts
-            found = optimize_parts(*given, keep, known)
+            before = None if self.check is None else self.check.part
+            found = optimize_parts(*given, keep, known, before)
         click.echo("\n".join(found.sentences))
         after = replace(self, parts=found.parts, meshes=found.meshes, shape=found)
-        return self._followed_by(after, run, check, say)
-
-    def simplified(self, run: Path, tolerance: float | None, check: bool, say: Say) -> Made:
-        """Return it with optimised shapes in straight lines and fillets."""
-        from dolfinopt.part.plane.part import PlanePart, simplified
-
-        parts = {
-            k: simplified(one, tolerance)
-            for k, one in self.parts.items()
-            if isinstance(one, PlanePart)
-        }
-        after = replace(self, parts=parts, meshes=_meshes(parts, check, say))
-        return self._followed_by(after, run, check, say)
-
-    def _followed_by(self, after: Made, run: Path, check: bool, say: Say) -> Made:
-        """Return other parts with what they do, and that of the first ones beside it."""
-        after = replace(after, check=None)
-        after = after.checked(run, say) if check else after
-        if self.check is None or after.check is None:
-            return after
-        before = self.check.before or self.check.part
-        return replace(after, check=replace(after.check, before=before))
+        return after.checked(run, say) if check else after
 
     def write(self, run: Path, target: Path, plots: bool) -> None:
         """Write the files, all or none."""

@@ -18,6 +18,7 @@ from mpi4py import MPI
 from scipy.interpolate import make_interp_spline
 from scipy.spatial import cKDTree
 
+from dolfinopt.density.measured import GREY
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 from dolfinopt.mesh.checks import cell_sizes, facet_corners
@@ -384,9 +385,11 @@ class Filled:
     """How much of an arm a design fills.
 
     Attributes:
+        name: of the arm.
         x_phys: (n_cells,) physical densities.
     """
 
+    name: str
     x_phys: np.ndarray
 
     @property
@@ -420,6 +423,18 @@ class Filled:
         """Share of the material in cells of densities between 0.1 and 0.9."""
         gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
         return float((self.x_phys * self.sizes)[gray].sum() / self.volume)
+
+    @property
+    def gray_words(self) -> list[str]:
+        """What is said of a grey design."""
+        if self.grayness <= GREY:
+            return []
+        return [
+            f"arm {self.name!r}: grayness {self.grayness:.2g}: {100.0 * self.gray_share:.0f} % of "
+            "the material is in cells that are neither solid nor void; the part is another design "
+            'than the optimised one; with design.projection = "robust" more iterations make it '
+            "crisp"
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -474,6 +489,16 @@ class Domain(Filled):
     def cell(self) -> float:
         """Size of a cell: the root of the median area, m."""
         return float(np.sqrt(np.median(self.area)) * (1.0 if self.corners.shape[1] == 4 else 1.5))
+
+    @property
+    def edges(self) -> list[Edge]:
+        """The curves of the arm's own outline, and around what stays void or solid."""
+        return [*self.outline.edges, *self.void.edges, *self.solid.edges]
+
+    @property
+    def outer_edges(self) -> int:
+        """Number of the first of them that no material lies beyond."""
+        return len(self.outline.edges) + len(self.void.edges)
 
     @property
     def extent(self) -> float:

@@ -37,7 +37,7 @@ UNITS = {
     "area": "m2", "volume": "m3", "mass": "kg", "design_volume": "m3", "distance": "m",
     "tolerance": "m", "tool_radius": "m", "smallest_concave_radius": "m", "thinnest_member": "m",
     "narrowest_gap": "m", "least_wall": "m", "largest_wall": "m", "min_wall": "m", "max_wall": "m",
-    "widths_to": "m", "filter_radius": "m",
+    "widths_to": "m", "filter_radius": "m", "cavities": "m",
 }  # fmt: skip
 
 

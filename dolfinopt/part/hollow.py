@@ -151,7 +151,7 @@ class HollowPart:
         yield ".stl", triangle_bytes(MM * self.facets, f"{title}, mm")
         yield ".3mf", three_mf_bytes(self.surface, name)
 
-    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> WallMesh:
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> WallMesh:
         """Return hexahedra: the design's, or a quarter of each, see `part.Part`."""
         hull, thickness = self.hull, self.thickness
         if coarser < self.COARSER:

@@ -1,6 +1,6 @@
 """Meshes of parts: triangles along a plane part's curves, tetrahedra in a solid part's volume.
 
-In the plane the outline's nodes stand on the curves, moved outwards by what the straight sides
+In the plane the outline's nodes stand on the curves, along arcs moved by what the straight sides
 between them would cut off: the mesh has the part's area, and the error of its outline is one of
 shape alone. Meshes are moved with the curves, and written.
 """
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 CORNER = np.radians(10.0)  # turn of the outline from which on a joint of curves is a corner
 FOLDED = 1e-3  # shape of a triangle, 1 where it is equilateral, below which it counts as folded
-# Gauss points on [0, 1] and weights, exact for polynomials of degree nine.
-_GAUSS, _WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(5), (1.0, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,19 +130,34 @@ class BodyMesh:
         return replace(moved, points=self.points + step)
 
     def at_outline(self, by_nodes: np.ndarray) -> np.ndarray:
-        """Return derivatives (k, 2) by the sides' first nodes, the nodes inside moving with them.
+        """Return derivatives (m, k, 2) by the sides' first nodes, nodes inside moving with them.
 
         The transpose of `morphed`.
 
         Args:
-            by_nodes: (n, 2) derivatives by the places of all nodes.
+            by_nodes: (m, n, 2) derivatives by the places of all nodes.
         """
-        found = by_nodes.copy()
+        count = len(self.points)
+        found = np.moveaxis(by_nodes, 1, 0).reshape(count, -1).copy()
         inner, laplacian = self._inner()
         if inner.any():
-            adjoint = splu(laplacian[inner][:, inner].tocsc()).solve(by_nodes[inner])
+            adjoint = splu(laplacian[inner][:, inner].tocsc()).solve(found[inner])
             found[~inner] -= laplacian[inner][:, ~inner].T @ adjoint
-        return found[self.sides[:, 0]]
+        whole = np.moveaxis(found.reshape(count, *by_nodes.shape[::2]), 0, 1)
+        return whole[:, self.sides[:, 0]]
+
+    @property
+    def owners(self) -> np.ndarray:
+        """Piece (k,) that the first node of every side belongs to: between two, to the arc."""
+        before = np.empty(len(self.sides), dtype=int)
+        order = np.argsort(self.sides[:, 0])
+        before[order[np.searchsorted(self.sides[order, 0], self.sides[:, 1])]] = np.arange(
+            len(before)
+        )
+        arc = np.array([isinstance(piece.curve, Arc) for piece in self.shape.pieces])
+        ends = self.piece[before]
+        joint = (self.span[:, 0] == 0.0) & arc[ends] & ~arc[self.piece]
+        return np.where(joint, ends, self.piece)
 
     def _inner(self) -> tuple[np.ndarray, sp.csr_matrix]:
         """Return which nodes (n,) lie inside, and the Laplacian (n, n) by which they follow."""
@@ -168,43 +181,18 @@ def triangle_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def outline_places(mesh: BodyMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return the nodes (n,) of the outline and where they belong (n, 2), m.
 
-    That is on the curve, and from there along the normal by the area A between curve and straight
-    sides over their length l, (A_before + A_after) / (l_before + l_after), and by a small distance
-    that is the same all around, so that the sides enclose what the curves do. Ends of straight
-    pieces, and corners, stay on the curves.
+    That is on the curve, along an arc so far off it that the straight sides between its nodes
+    enclose its area, see `Arc.off`.
     """
-    pieces = mesh.shape.pieces
-    count = len(mesh.sides)
-    begin, normal, lost = np.empty((count, 2)), np.empty((count, 2)), np.zeros(count)
-    chord, curved = np.empty(count), np.zeros(count, dtype=bool)
-    back = np.empty((count, 2))  # normal at the end of each side
+    places = np.empty((len(mesh.sides), 2))
     for k in np.unique(mesh.piece):
-        here = mesh.piece == k
-        curve, (t0, t1) = pieces[k].curve, mesh.span[here].T
-        p0, p1 = curve.at(t0), curve.at(t1)
-        begin[here], chord[here] = p0, np.linalg.norm(p1 - p0, axis=1)
-        normal[here], back[here] = normals(curve, t0), normals(curve, t1)
-        if isinstance(curve, Line):
-            continue
-        curved[here] = True
-        t = (t0[:, None] + (t1 - t0)[:, None] * _GAUSS).ravel()
-        swept = _cross(curve.at(t), curve.derivative(t)).reshape(-1, len(_GAUSS)) @ _WEIGHTS
-        lost[here] = 0.5 * ((t1 - t0) * swept - _cross(p0, p1))
-    before = np.empty(count, dtype=int)
-    order = np.argsort(mesh.sides[:, 0])
-    place = np.searchsorted(mesh.sides[order, 0], mesh.sides[:, 1])
-    before[order[place]] = np.arange(count)  # the side that ends where this one begins
-    smooth = (normal * back[before]).sum(axis=1) > np.cos(CORNER)
-    moves = smooth & curved & curved[before]
-    length = chord + chord[before]
-    shift = np.where(moves, (lost + lost[before]) / length, 0.0)
-    after = np.empty(count, dtype=int)
-    after[before] = np.arange(count)
-    for _ in range(2 if moves.any() else 0):  # what is missing at corners and straight pieces
-        places = begin + shift[:, None] * normal
-        missing = mesh.shape.area - 0.5 * _cross(places, places[after]).sum()
-        shift[moves] += missing / (0.5 * length[moves].sum())
-    return mesh.sides[:, 0], begin + shift[:, None] * normal
+        here = np.flatnonzero(mesh.piece == k)
+        curve, t = mesh.shape.pieces[k].curve, mesh.span[here, 0]
+        places[here] = curve.at(t)
+        if isinstance(curve, Arc):
+            share = curve.off(t, len(here))[0][:, None]
+            places[here] = curve.centre + share * (places[here] - curve.centre)
+    return mesh.sides[:, 0], places
 
 
 def normals(curve: Curve, t: np.ndarray) -> np.ndarray:
@@ -221,10 +209,12 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-TURN = 0.9  # of the outline along a side of a cell, rad
+TURN = 0.6  # of the outline along a side of a cell, rad, but where a finer one is asked for
+FINE = 0.2  # rad, there; halved for every further time
+PLATE_TURN = 0.9  # the same of plates in space, whose cells are as long as they are thick
 WALL = 1.0  # side of a cell over the width of the member
 LARGEST = 2.5  # side of a cell, cells of the design
-SMALLEST = 0.15  # likewise: tighter curves are cut short
+SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
 FINER = 4  # times that sides are halved until none cross each other
 SAMPLES = 0.3  # distance of places where sizes are looked at, cells of the design
@@ -233,7 +223,11 @@ OPPOSED = -0.3  # cosine between the normals of both sides of a member, at most
 
 
 def body_mesh(
-    shape: Shape, cell: float, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()
+    shape: Shape,
+    cell: float,
+    coarser: float = 1.0,
+    finer: Sequence[np.ndarray] = (),
+    turn: float | np.ndarray = TURN,
 ) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
@@ -241,15 +235,18 @@ def body_mesh(
         shape: m.
         cell: size of the design's cells, m.
         coarser: factor of the sides of all triangles.
-        finer: places (n, 2), m, near each of which sides are halved, once for every array.
+        finer: places (n, 2), m, near which sides are half as long, and the outline turns by `FINE`
+            along them; half of both for every further array.
+        turn: of the outline along a side elsewhere, rad; one for all pieces, or one each.
 
     Raises:
         InputError: straight sides along its curves cross each other, however short.
     """
+    turns = np.broadcast_to(turn, len(shape.pieces))
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = _sizes(shape, samples, cell, finer)
+    sizes = _sizes(shape, samples, cell, finer, turns)
     for _ in range(FINER):
-        outline = _outline(shape, samples, [coarser * size for size in sizes], coarser * TURN)
+        outline = _outline(shape, samples, [coarser * size for size in sizes], coarser * turns)
         if outline.is_simple:  # Gmsh would end the process
             points, triangles = _triangulated(outline)
             mesh = BodyMesh(shape, points, triangles, outline.sides, outline.piece, outline.span)
@@ -303,14 +300,14 @@ class _Outline:
 
 
 def _outline(
-    shape: Shape, samples: Sequence[np.ndarray], sizes: Sequence[np.ndarray], turn: float
+    shape: Shape, samples: Sequence[np.ndarray], sizes: Sequence[np.ndarray], turns: np.ndarray
 ) -> _Outline:
     loops, piece, span, spacing = [], [], [], []
     number = 0
     for loop in shape.loops:
         corners = []
         for one in loop:
-            t, h = _divided(one.curve, samples[number], sizes[number], turn)
+            t, h = _divided(one.curve, samples[number], sizes[number], turns[number])
             corners.append(one.curve.at(t[:-1]))
             piece.append(np.full(len(t) - 1, number))
             span.append(np.stack([t[:-1], t[1:]], axis=1))
@@ -330,20 +327,28 @@ def _sampled(curve: Curve, spacing: float) -> np.ndarray:
 
 
 def _sizes(
-    shape: Shape, samples: Sequence[np.ndarray], cell: float, finer: Sequence[np.ndarray]
+    shape: Shape,
+    samples: Sequence[np.ndarray],
+    cell: float,
+    finer: Sequence[np.ndarray],
+    turns: np.ndarray,
 ) -> list[np.ndarray]:
     """Return the wanted sides of cells at the samples of every piece, m."""
     curves = shape.curves
     points = np.vstack([c.at(t) for c, t in zip(curves, samples, strict=True)])
     inward = -np.vstack([normals(c, t) for c, t in zip(curves, samples, strict=True)])
     bend = np.abs(np.concatenate([curvature(c, t) for c, t in zip(curves, samples, strict=True)]))
+    bend = np.maximum(bend, 1e-9 / cell)
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     wall = facing(points, inward, near, 1.0)
-    size = np.minimum(WALL * wall, TURN / np.maximum(bend, 1e-9 / cell))
-    size = np.clip(size, SMALLEST * cell, LARGEST * cell)
-    for places in finer:
-        away = cKDTree(places).query(points)[0]
-        size = np.where(away < np.maximum(2.0 * size, SAMPLES * cell), 0.5 * size, size)
+    turn = np.repeat(turns, [len(t) for t in samples])
+    side = np.minimum(WALL * wall, LARGEST * cell)
+    for number, places in enumerate(finer):
+        size = np.minimum(side, turn / bend)
+        here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)
+        turn = np.where(here, np.minimum(turn, FINE * 0.5**number), turn)
+        side = np.where(here, 0.5 * side, side)
+    size = np.maximum(np.minimum(side, turn / bend), SMALLEST * cell)
     for _ in range(3):
         size = (size[near] + GROWTH * apart).min(axis=1)
     return np.split(size, np.cumsum([len(t) for t in samples])[:-1])
@@ -375,17 +380,16 @@ def _divided(
     curve: Curve, t: np.ndarray, size: np.ndarray, turn: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return parameters of nodes along a curve, ends included, and sizes at all but the last."""
-    # Nodes stand where curves were joined: without them sides on both sides of a neck may cross.
     step = np.linalg.norm(np.diff(curve.at(t), axis=0), axis=1)
     passed = np.append(0.0, np.cumsum(step * 0.5 * (1.0 / size[:-1] + 1.0 / size[1:])))
-    joints = curve.joints if isinstance(curve, Spline) else np.empty(0)
-    ends = np.concatenate([[0.0], np.interp(joints, t, passed), passed[-1:]])
-    least = 1 if isinstance(curve, Line) or len(joints) else 2
+    least = 1 if isinstance(curve, Line) else 2
     if isinstance(curve, Arc):
         least = max(least, int(np.ceil(abs(curve.sweep) / turn)))
-    counts = [max(int(np.ceil(b - a - 0.2)), least) for a, b in pairwise(ends)]
-    places = [np.linspace(a, b, n + 1)[:-1] for (a, b), n in zip(pairwise(ends), counts)]
-    at = np.interp(np.concatenate([*places, passed[-1:]]), passed, t)
+        # Evenly: the area is exact then, see `outline_places`.
+        at = np.linspace(0.0, 1.0, max(int(np.ceil(passed[-1] - 0.2)), least) + 1)
+    else:
+        count = max(int(np.ceil(passed[-1] - 0.2)), least)
+        at = np.interp(np.linspace(0.0, passed[-1], count + 1), passed, t)
     at[0], at[-1] = 0.0, 1.0
     return at, np.interp(at[:-1], t, size)
 
@@ -543,7 +547,8 @@ class PlateMesh(Tetrahedra):
 
 def _plate_mesh(flat: PlanePart, size: float) -> PlateMesh:
     thickness = flat.domain.thickness
-    return extruded(flat.mesh(size / flat.domain.cell), thickness, max(1, round(thickness / size)))
+    face = body_mesh(flat.shape, flat.domain.cell, size / flat.domain.cell, turn=PLATE_TURN)
+    return extruded(face, thickness, max(1, round(thickness / size)))
 
 
 def extruded(face: BodyMesh, thickness: float, layers: int) -> PlateMesh:

@@ -31,16 +31,14 @@ class Curves:
     """What is asked of the curves of parts.
 
     Attributes:
-        tool_radius: of concave corners, m; None: a fifth of a cell.
-        tolerance: of the curves, m; None: 0.1 mm or a tenth of a cell, the smaller.
-        arcs: lines and arcs in place of splines.
-        simplify: straight lines and fillets within the tolerance.
+        tool_radius: least of concave corners, m; None: 3 mm.
+        tolerance: how far sides may lie from the densities' outline, m; None: half a cell.
+        rounds: whether radii are whole half millimetres.
     """
 
     tool_radius: float | None = None
     tolerance: float | None = None
-    arcs: bool = False
-    simplify: bool = False
+    rounds: bool = False
 
     @property
     def is_default(self) -> bool:
@@ -137,12 +135,13 @@ class Part(Protocol):
     def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
         """Yield how the names of its files end, and what they hold; `name` and title of it."""
 
-    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> PartMesh:
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> PartMesh:
         """Return a mesh of it, on this process alone.
 
         Args:
             coarser: factor of the sides of all cells.
-            finer: places (n, d), m, near each of which sides are halved, once for every array.
+            finer: places (n, d), m, near which arcs of a coarse mesh are divided finely, twice as
+                finely for every further array; None: finely everywhere.
 
         Raises:
             InputError: Gmsh cannot mesh it.
@@ -166,7 +165,7 @@ class Part(Protocol):
 
 
 def make_parts(
-    scene: Scene, folder: Path, curves: Curves = DEFAULTS, world: MPI.Comm | None = None
+    scene: Scene, folder: Path, curves: Curves | None = None, world: MPI.Comm | None = None
 ) -> dict[int, Part]:
     """Make the parts of the arms that have a design of their own (collective on `world`).
 
@@ -175,7 +174,7 @@ def make_parts(
     Args:
         scene: of the run.
         folder: with its design.npz.
-        curves: what is asked of the curves.
+        curves: what is asked of the curves; by default what the scene asks for.
         world: the ranks that share the arms; by default this one alone.
 
     Returns:
@@ -195,6 +194,7 @@ def make_parts(
     from dolfinopt.parallel import on_root, partition_arms, together
 
     world = MPI.COMM_SELF if world is None else world
+    curves = Curves(scene.part.tool_radius, scene.part.tolerance) if curves is None else curves
     on_root(world, _check, folder, curves)
     check_budget(world, scene)
     partition = partition_arms(world, scene.cell_counts, whole=True)
@@ -290,6 +290,6 @@ def mesh_parts(parts: Mapping[int, Part], coarse: bool = True) -> Meshes:
     """
     larger: dict[int, PartMesh] = {}
     with suppress(InputError):  # of walls thinner than such cells
-        larger = {k: one.mesh(one.COARSER) for k, one in parts.items() if coarse}
+        larger = {k: one.mesh(one.COARSER, ()) for k, one in parts.items() if coarse}
     fine = {k: one.mesh() for k, one in parts.items()}
     return Meshes(larger if len(larger) == len(fine) else {}, fine)

@@ -10,10 +10,10 @@ Source: Williams (1952), doi:10.1115/1.4010553.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -26,11 +26,14 @@ from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.part.mesh import CORNER
 from dolfinopt.part.plane.curves import Shape, direction
 from dolfinopt.part.solid.surface import distance_to_faces
+from dolfinopt.responses.measured import NEGLIGIBLE_POWER_SHARE
 from dolfinopt.responses.products import Products, StressProduct
 from dolfinopt.responses.stress import (
+    ArmLoads,
     PointStress,
     Stress,
     arm_loads,
+    every,
     maxima,
     motions_of,
     screen,
@@ -46,9 +49,10 @@ if TYPE_CHECKING:
     from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.domain import SolidDomain
     from dolfinopt.part.part import Part
+    from dolfinopt.responses.response import Analysis
     from dolfinopt.scene.tables.objective import Objective
 
-HOT = 0.8  # of the largest stress, from which on a place is worth a finer mesh
+HOT = 0.65  # of the largest stress, from which on a place is worth a finer mesh
 SHOWN = 0.999  # of the largest stress elsewhere, at singular points in pictures
 
 
@@ -92,22 +96,37 @@ def stress_of_parts(
         state = arms[k].current
         points = parts[k].stress(state, state.load_fields)
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
+        peaks: dict[int, tuple[Peak, ArmLoads]] = {}
         for one in loads:
-            a, t = one.coefficients, motions[one.motion].t
-            best = points.peak(a, t, np.flatnonzero(counts))
-            known = found.get(one.place)
-            if known is not None and known.peak.value >= best.value:
-                continue
-            whole = points.peak(a, t, np.arange(len(counts)))
-            at, when = maxima(MPI.COMM_SELF, points.A, a)
-            hot = points.places[counts & (at > HOT * best.value)]
-            # What has no limit would be all that the colours show.
-            at[~counts] = np.minimum(at[~counts], SHOWN * best.value)
-            worst = at[points.corners].argmax(axis=1)
-            node = points.corners[np.arange(len(worst)), worst]
-            cells = ArmStress(best, whole, at[node], t[when[node]])
-            found[one.place] = PartStress(best, whole, hot, cells)
+            best = points.peak(one.coefficients, motions[one.motion].t, np.flatnonzero(counts))
+            if one.place not in peaks or best.value > peaks[one.place][0].value:
+                peaks[one.place] = best, one
+        for place, (best, one) in peaks.items():
+            found[place] = _worst_of(points, counts, best, one, motions[one.motion].t)
     return found
+
+
+def _worst_of(
+    points: CornerStress, counts: np.ndarray, best: Peak, loads: ArmLoads, t: np.ndarray
+) -> PartStress:
+    """Return the stress of an arm along the motion in which it is largest.
+
+    Args:
+        points: its stress.
+        counts: (n,) whether they are regular.
+        best: the largest of those.
+        loads: of the arm along the motion.
+        t: (k,) instants, s.
+    """
+    at, when = maxima(MPI.COMM_SELF, points.A, loads.coefficients)
+    top = int(at.argmax())
+    whole = Peak(float(at[top]), tuple(map(float, points.places[top])), float(t[when[top]]))
+    hot = points.places[counts & (at > HOT * best.value)]
+    # What has no limit would be all that the colours show.
+    at[~counts] = np.minimum(at[~counts], SHOWN * best.value)
+    worst = at[points.corners].argmax(axis=1)
+    node = points.corners[np.arange(len(worst)), worst]
+    return PartStress(best, whole, hot, ArmStress(best, whole, at[node], t[when[node]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +154,26 @@ class CornerStress(PointStress):
         largest = screen(MPI.COMM_SELF, self.A[:, chosen], a)
         place = tuple(map(float, self.places[chosen][largest.point]))
         return Peak(largest.largest, place, float(t[largest.instant]))
+
+    def means(
+        self, motions: Sequence[np.ndarray], exponent: float
+    ) -> Callable[[np.ndarray], float]:
+        """Return what gives the p-mean over some points (n,), and over motions a (k, m), Pa.
+
+        That of `OutlineStress` of these points, which leaves out instants of hardly any stress.
+        """
+        summed = [a[every(len(a))[::2]] for a in motions]
+        stress = np.sqrt(np.square(self.A @ np.concatenate(summed).T).sum(axis=0))
+
+        def mean(some: np.ndarray) -> float:
+            own = stress[some]
+            instants = own.max(axis=0)
+            unit = max(float(instants.max()), 1e-300)
+            kept = instants >= NEGLIGIBLE_POWER_SHARE ** (1.0 / exponent) * unit
+            total = float(((own[:, kept] / unit) ** exponent).sum())
+            return unit * (total / own.size) ** (1.0 / exponent)
+
+        return mean
 
     def counted(self, counts: np.ndarray) -> CornerStress:
         """Return it with the points (n,) of the outline that count alone."""
@@ -203,15 +242,34 @@ class OutlineStress(Stress):
 
     name = "outline_stress"
 
-    def __init__(self, options: Objective, parts: Mapping[int, Part]):
-        """Take the scene's options, and the parts by their place in the chain."""
+    def __init__(
+        self,
+        options: Objective,
+        parts: Mapping[int, Part],
+        nodes: Mapping[int, np.ndarray] | None = None,
+    ):
+        """Take the scene's options, and the parts by their place in the chain.
+
+        Of nodes only those count (n,), by the arms; of arms without an entry none.
+        """
         super().__init__(options, limited=True)
-        self._parts = parts
+        self._parts, self._nodes = parts, nodes
+        self._known: dict[int, Any] = {}
+
+    def once(self, analysis: Analysis, find: Callable[[], Mapping[int, Any]]) -> dict[int, Any]:
+        """Return what is found of this rank's designs; of some nodes it is their own."""
+        if self._nodes is None:
+            return super().once(analysis, find)
+        if not self._known:
+            self._known = dict(find())
+        return self._known
 
     def points_of(self, index: int, state: DesignState, fields: LoadFields) -> CornerStress:
         """Return the stress of an arm's design on its outline."""
         part = self._parts[index]
         found = part.stress(state, fields)
+        if self._nodes is not None:
+            return found.counted(self._nodes.get(index, np.zeros(len(found.places), dtype=bool)))
         return found.counted(part.regular(found.places, self.options.stress_margin))
 
 

@@ -208,18 +208,7 @@ def thinnest_member(shape: Shape, cell: float) -> float | None:
         shape: of the part.
         cell: size of the design's cells, m.
     """
-    found = narrowest_within(polygon_of(shape, 0.02 * cell), cell)
-    return None if found is None else found.size
-
-
-def narrowest_within(polygon: Any, cell: float, most: float = np.inf) -> Narrowest | None:
-    """Return the narrowest place of a polygon, of all narrower than `most`, m.
-
-    Args:
-        polygon: of material (shapely), m.
-        cell: size of the design's cells, m.
-        most: m.
-    """
+    polygon = polygon_of(shape, 0.02 * cell)
     import shapely
 
     shapely.prepare(boundary := polygon.boundary)
@@ -235,7 +224,8 @@ def narrowest_within(polygon: Any, cell: float, most: float = np.inf) -> Narrowe
     def distance(places: np.ndarray) -> np.ndarray:
         return np.asarray(shapely.distance(shapely.points(places), boundary))
 
-    return narrowest_place(Boundary(points, outward, spacing, distance), most)
+    found = narrowest_place(Boundary(points, outward, spacing, distance))
+    return None if found is None else found.size
 
 
 def _between(ring: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:

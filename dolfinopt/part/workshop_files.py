@@ -288,18 +288,18 @@ def _string(text: str) -> str:
 # -- drawings for cutters and browsers: DXF and SVG --------------------------------------------
 
 
-OUTLINE, HOLES = "outline", "holes"  # layers
+OUTLINE, HOLES, BORES = "outline", "holes", "bores"  # layers
 MARGIN = 5.0  # mm around a picture
 
 
 def dxf_text(shape: Shape) -> str:
-    """Return a DXF of version R2010: lines, arcs, circles and splines on two layers."""
+    """Return a DXF of version R2010: lines, arcs, circles and the arm's own splines."""
     with _undated():
         document = _document("R2010")
         model = document.modelspace()
         for k, loop in enumerate(shape.loops):
             for piece in loop:
-                _draw(model, piece.curve, {"layer": HOLES if k else OUTLINE})
+                _draw(model, piece.curve, {"layer": _layer(k, loop)})
         return _text(document)
 
 
@@ -314,7 +314,7 @@ def r12_text(shape: Shape, tolerance: float) -> str:
         document = _document("R12")
         model = document.modelspace()
         for k, loop in enumerate(shape.loops):
-            look = {"layer": HOLES if k else OUTLINE}
+            look = {"layer": _layer(k, loop)}
             if _is_circle(loop):
                 _draw(model, loop[0].curve, look)
                 continue
@@ -345,6 +345,7 @@ def _document(version: str) -> Any:
     document.header["$MEASUREMENT"] = 1
     document.layers.add(OUTLINE, color=7)
     document.layers.add(HOLES, color=1)
+    document.layers.add(BORES, color=5)
     return document
 
 
@@ -355,6 +356,13 @@ def _text(document: Any) -> str:
     stream = io.StringIO()
     document.write(stream)
     return stream.getvalue()
+
+
+def _layer(number: int, loop: tuple[Piece, ...]) -> str:
+    """Return the layer of a loop: round holes of the arm's own are bores."""
+    if number and _is_circle(loop) and not loop[0].free:
+        return BORES
+    return HOLES if number else OUTLINE
 
 
 def _is_circle(loop: tuple[Piece, ...]) -> bool:

@@ -13,7 +13,7 @@ Source: Ferrari & Sigmund (2019), doi:10.1007/s00158-019-02253-3.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -159,12 +159,18 @@ def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuc
         trajectory: of these arms; of scenarios the worst counts.
     """
     scene, motions = next(iter(arms.values())).scene, motions_of(trajectory)
-    loads, found = arm_loads(scene, motions), list[LeastBuckling]()
-    for k, arm in arms.items():
-        for one in _of_design(arm.current, loads[k]):
-            mu, motion = float(one.modes.inverse[0]), motions[one.loads.motion]
+    found = []
+    for k, loads in arm_loads(scene, motions).items():
+        # All motions one after the other: what is worst along one tells of the others, too.
+        whole = np.concatenate([one.coefficients / one.stiffer for one in loads])
+        of, first = np.repeat(range(len(loads)), [len(one.instants) for one in loads]), loads[0]
+        every = replace(first, coefficients=whole, stiffer=1.0, instants=np.arange(len(whole)))
+        for each in pressed(arms[k].current, every):
+            one = loads[of[each.instant]]
+            own = each.instant - int(np.argmax(of == of[each.instant]))
+            mu, t = float(each.modes.inverse[0]), motions[one.motion].t[own]
             factor = 1.0 / mu if mu * LARGEST_FACTOR > 1.0 else float("inf")
-            found.append(LeastBuckling(factor, one.loads.place, float(motion.t[one.instant])))
+            found.append(LeastBuckling(factor, one.place, float(t)))
     return min(found, key=lambda one: one.factor, default=None)
 
 

@@ -209,6 +209,13 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     total = sum(link.own.mass for link in after.links.values())
     rest = sum(link.own.mass for name, link in before.links.items() if name != "forearm")
     assert total == pytest.approx(rest + summary["mass"]["forearm"], rel=1e-9)
+    # Parts that were made are the links, whatever has become of their shape.
+    run("part", tmp_path / "run", "--no-check", "--no-plots")
+    thinner = trimesh.load(tmp_path / "run" / "part" / "forearm.stl")
+    thinner.apply_scale([1.0, 0.5, 1.0]).export(tmp_path / "run" / "part" / "forearm.stl")
+    run("export", tmp_path / "run", "--urdf", "--overwrite")
+    link = trimesh.load(tmp_path / "run" / "urdf" / "forearm.stl")
+    assert link.volume == pytest.approx(1e-9 * thinner.volume, rel=1e-5)
 
 
 def test_a_robot_is_never_replaced_by_the_new_one(tmp_path):

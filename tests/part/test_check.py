@@ -72,8 +72,8 @@ def test_buckling_of_the_part_stands_in_the_table(made):
     row = check.table().loc["buckling"]
     assert row["unit"] == "-" and np.isnan(row["density"]) and np.isnan(row["crisp"])
     assert row["part"] == check.part.buckling.factor > checks.SAFE
-    # 196.5 on 5374 triangles, 196.8 on 1403; 398 here, 1.6 % stiffer against it.
-    assert row["part"] == pytest.approx(196.5, rel=0.03)
+    # 191.2 on 2586 triangles all over, 190.15 on 4960, 190.06 on 9536.
+    assert row["part"] == pytest.approx(190.06, rel=5e-3)
     values = check.to_dict()["table"]["buckling"]
     assert values == {"unit": "-", "density": None, "crisp": None, "part": row["part"]}
     assert not any("buckles" in text for text in check.warnings)
@@ -211,7 +211,7 @@ def test_parts_of_a_design(tmp_path):
         design[name] = 1.0 * ((np.abs(y) > 0.015) | (np.abs(x - 0.5) < 0.06))
     parts = model.make_parts(design, tmp_path / "parts", tolerance=1e-3)
     for part in parts.values():
-        assert part.shape.area == pytest.approx(part.domain.volume, rel=1e-6)
+        assert part.shape.area == pytest.approx(part.domain.volume, rel=1e-4)
         assert len(part.shape.loops) == 3
     assert (tmp_path / "parts" / "arm2.step").exists()
     with pytest.raises(InputError, match="holds results already"):

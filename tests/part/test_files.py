@@ -123,15 +123,15 @@ def test_dxf_is_clean_and_has_two_layers(part, name):
     audit = document.audit()
     assert not audit.errors and not audit.fixes
     model = document.modelspace()
-    assert {entity.dxf.layer for entity in model} == {"outline", "holes"}
-    circles = list(model.query("CIRCLE"))
+    layers = {"outline", "holes"} | ({"bores"} if bores_of(part) else set())
+    assert {entity.dxf.layer for entity in model} == layers
+    circles = [one for one in model.query("CIRCLE") if one.dxf.layer == "bores"]
     assert [c.dxf.radius for c in circles] == pytest.approx([10.0] * bores_of(part), abs=1e-6)
     if name == "arm1.dxf":
         assert document.dxfversion == "AC1024"
         assert document.header["$INSUNITS"] == 4  # mm
         assert len(model) == figures["curves"]
-        count = sum(len(spline.control_points) for spline in model.query("SPLINE"))
-        assert count == figures["control_points"]
+        assert not model.query("SPLINE")
     else:
         assert document.dxfversion == "AC1009"
         assert {entity.dxftype() for entity in model} <= {"POLYLINE", "CIRCLE"}
@@ -347,6 +347,7 @@ def test_bad_design_ends_two_ranks_with_one_line(tmp_path):
     done = shell("part", folder, *WORDS, ranks=2)
     assert done.returncode == 2
     lines = [line for line in done.stderr.splitlines() if line.startswith("dolfinopt")]
+    lines.sort(key=lambda line: "arm2" in line)  # two ranks may print them in any order
     assert "only files of arm1" in lines[0]
     assert len(lines) == 2 and "arm 'arm2'" in lines[1] and "hang together" in lines[1]
     assert {path.stem.split("_")[0] for path in (folder / "part").glob("arm*")} == {"arm1"}

@@ -8,22 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import runs
-import shapely
 from cutter import deepest_left
 from parts import folder_with, frame, write_run
-from runs import refusal, refused, run
+from runs import refused, run
 
 from dolfinopt import load_scene
 from dolfinopt.cli.shared import scene_of
-from dolfinopt.errors import InputError
-from dolfinopt.part.optimize import Descent, Problem, optimize_parts
+from dolfinopt.part.optimize import Descent, _free, optimize_parts
 from dolfinopt.part.part import Curves, make_parts
-from dolfinopt.part.plane.curves import MIRROR, Arc, Spline, direction
-from dolfinopt.part.plane.free_outline import free_outline
-from dolfinopt.part.plane.layouts import struts_of, trusses_of, without
-from dolfinopt.part.plane.part import cut, make_part
-from dolfinopt.part.widths import narrowest_within
-from dolfinopt.responses.constraints import EXCESS
+from dolfinopt.part.plane.curves import MIRROR, Arc, Line
+from dolfinopt.part.plane.layouts import trusses_of
+from dolfinopt.part.problem import Problem
+from dolfinopt.part.search import SidesSearch
 
 pytestmark = pytest.mark.serial
 
@@ -55,79 +51,66 @@ def test_compliance_falls_at_no_more_volume(made):
     assert "limits met" in lines[-1] and "all limits kept" in found.sentences[0]
 
 
-def test_what_is_not_free_stays_and_joints_stay_smooth(made):
+def test_what_is_not_free_stays_and_symmetry_holds(made):
     before, after = made[2][0].shape, made[3].parts[0].shape
-    held = [piece.curve for piece in before.pieces if not piece.free]
-    still = [piece.curve for piece in after.pieces if not piece.free]
-    assert held and [one for one in still if one in held] == held
-    # Besides them the tool's arcs beside them.
-    assert all(isinstance(one, Arc) for one in still if one not in held)
-    for loop in after.loops:
-        for k in range(len(loop)):
-            one, other = loop[k - 1].curve, loop[k].curve
-            assert np.abs(one.end - other.start).max() < 1e-12
-            if loop[k - 1].free and loop[k].free:  # halves of a periodic spline
-                assert direction(one, 1.0) @ direction(other, 0.0) > 1.0 - 1e-9
-    assert after.is_simple(1e-5)
-
-
-def test_curves_follow_those_of_the_part(made):
-    """Their area by moves is its difference, and symmetric ones stay so."""
-    points = np.vstack([c.points for c in made[3].parts[0].shape.curves if isinstance(c, Spline)])
+    held = [piece.label for piece in after.pieces if not piece.free]
+    assert sorted(held) == sorted(piece.label for piece in before.pieces if not piece.free)
+    assert {type(curve) for curve in after.curves} == {Line, Arc} and after.is_simple(1e-5)
+    points = np.vstack([curve.start for curve in after.curves])
     apart = np.linalg.norm(points[:, None] - points * MIRROR, axis=2).min(axis=1)
-    assert apart.max() < 1e-9
-    part = made[2][0]
-    outline = free_outline(part)
-    assert outline.shape.area == pytest.approx(part.shape.area, rel=2e-3)
-    assert outline.is_valid and len(outline.shape.loops) == len(part.shape.loops)
-    moves = outline.filtered(1e-6 * np.random.default_rng(0).normal(size=outline.count))
-    ends = [outline.moved(sign * moves).shape.area for sign in (1.0, -1.0)]
-    # Area is quadratic in the moves: central differences are exact.
-    assert ends[0] - ends[1] == pytest.approx(2.0 * outline.size_by_s() @ moves, rel=1e-6)
+    ends = np.linalg.norm(
+        points[:, None] - np.vstack([c.end for c in after.curves]) * MIRROR, axis=2
+    )
+    assert np.minimum(apart, ends.min(axis=1)).max() < 1e-9
+    assert after.concave_radius >= made[2][0].outline.tool_radius * (1.0 - 1e-6)
+
+
+def slopes_and_differences(problem, form, step):
+    """Return derivatives (1 + m, k) along some directions, and differences on such meshes."""
+    state = problem.evaluated({0: form}, {})
+    keys = sorted(state.places, key=lambda key: -state.places[key])[:2]
+    slopes = np.vstack([problem.slopes(state), *problem.stress_slopes(state, keys)])
+    directions = np.random.default_rng(0).normal(size=(2, form.count))
+    changes = []
+    for x in directions:
+        values = []
+        for sign in (1.0, -1.0):
+            moved = form.moved(sign * step * x)
+            every = problem.every({0: moved})
+            bodies = {k: one.followed(state.bodies[k]) for k, one in every.items()}
+            other = problem.evaluated({0: moved}, bodies, state.solutions)
+            scaled = [
+                (1.0 + state.places[key]) * other.means[key] / state.means[key] for key in keys
+            ]
+            values.append(np.append(other.against(state.held), scaled))
+        changes.append((values[0] - values[1]) / (2.0 * step))
+    return slopes @ directions.T, np.array(changes).T
 
 
 @pytest.mark.parametrize("kind", ["integral_compliance", "mass"])
 def test_slopes_are_differences(made, kind):
-    """Along an even offset and an uneven one; the sides' bulge, a per cent or two, is left out."""
-    scene = with_tables(made[1], objective={"kind": kind}, constraints={"deviation": 0.1})
-    problem, outline = Problem(scene, {}, {}), free_outline(made[2][0])
-    state = problem.evaluated({0: outline}, {})
-    slopes = problem.slopes(state)
-    uneven = 1.0 + 0.5 * np.sin(np.arange(outline.count))
-    for x in (np.ones(outline.count), uneven):
-        values = []
-        for sign in (1.0, -1.0):
-            moved = outline.moved(outline.filtered(1e-5 * sign * x))
-            bodies = {0: state.bodies[0].morphed(moved.shape)}
-            values.append(problem.evaluated({0: moved}, bodies).values)
-        change = values[0] - values[1]
-        assert change[[0, -1]] == pytest.approx(2e-5 * (slopes @ x)[[0, -1]], rel=3e-2)
-        # What is differentiated is the p-mean, whose ratio to the largest is held.
-        assert change[1] == pytest.approx(2e-5 * slopes[1] @ x, rel=0.3)
+    """Of objective, deviation, volume and of the stress of two places."""
+    limits = {"deviation": 0.1, "stress": 2e7}
+    scene = with_tables(made[1], objective={"kind": kind}, constraints=limits)
+    problem, form = Problem(scene, {}, {}, by_places=True), _free(made[1], 0, made[2][0])
+    exact, expected = slopes_and_differences(problem, form, 1e-7)
+    assert len(exact) == 5
+    for one, other in zip(exact, expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-4 * np.abs(other).max())
 
 
 def test_lightest_part_keeps_its_limit(made):
     """From a limit that the part exceeds by 2 %: the limit holds on the fine mesh in the end."""
     _, scene, parts, _, _ = made
     problem = Problem(scene, {}, {})
-    outlines = {0: free_outline(parts[0])}
+    outlines = {0: _free(scene, 0, parts[0])}
     deviation = problem.evaluated(outlines, {}).simulated.evaluation.max_deviation
     posed = with_tables(scene, objective={"kind": "mass"}, design={"volume_fraction": None},
                         constraints={"deviation": deviation / 1.02})  # fmt: skip
-    found = optimize_parts(posed, parts, 12, lambda _: None)
-    assert [one.met for one in found.best.limits] == [True]
+    lines = []
+    found = optimize_parts(posed, parts, 8, lines.append)
+    assert [one.met for one in found.best.limits] == [True], lines
     assert found.best.limits[0].value == pytest.approx(deviation / 1.02, rel=2e-2)
-
-
-def test_arcs_and_values_of_the_table_are_refused(made, monkeypatch):
-    """Before any outline is made."""
-    monkeypatch.setattr("dolfinopt.part.part.make_parts", None)
-    for change, words in (('part.curves="arcs"', ("part.curves", "splines")),
-                          ("part.starts=-1", ("0",))):  # fmt: skip
-        refusal(lambda: runs.scene("part.optimize=true", change), *words)  # noqa: B023
-    with pytest.raises(InputError, match="expected splines"):
-        run("part", made[0], "--curves", "arcs", "--optimize", "--no-plots", "--no-check")
-    assert not (made[0] / "part").exists()
 
 
 def test_slopes_of_a_repeated_design_are_differences(tmp_path):
@@ -140,18 +123,11 @@ def test_slopes_of_a_repeated_design_are_differences(tmp_path):
     images = frame, lambda x, y: frame(x / size[0], y / size[1])
     folder = write_run(tmp_path / "run", posed, *images)
     parts = make_parts(posed, folder)
-    problem, outline = Problem(posed, parts, {}), free_outline(parts[0], scale=min(size))
-    state = problem.evaluated({0: outline}, {})
-    both = problem.every({0: outline})
-    ratio = size[0] * size[1]
-    assert both[1].shape.area == pytest.approx(ratio * both[0].shape.area, rel=1e-12)
-    x, values = np.ones(outline.count), []
-    for sign in (1.0, -1.0):
-        moved = outline.moved(outline.filtered(1e-5 * sign * x))
-        meshes = problem.every({0: moved}).items()
-        bodies = {k: state.bodies[k].morphed(one.shape) for k, one in meshes}
-        values.append(problem.evaluated({0: moved}, bodies).values[0])
-    assert values[0] - values[1] == pytest.approx(2e-5 * problem.slopes(state)[0] @ x, rel=3e-2)
+    problem, form = Problem(posed, parts, {}), _free(posed, 0, parts[0])
+    exact, expected = slopes_and_differences(problem, form, 1e-7)
+    np.testing.assert_allclose(exact[0], expected[0], atol=1e-4 * np.abs(exact[0]).max())
+    both = problem.every({0: form})
+    assert both[1].sides.shape.is_simple(1e-5) and both[1].size < both[0].size
 
 
 def test_interrupted_search_keeps_the_best(made):
@@ -166,43 +142,6 @@ def test_interrupted_search_keeps_the_best(made):
     found = optimize_parts(scene, parts, STEPS, tell)
     assert found.interrupted and found.best.ending == "interrupted"
     assert found.best.iterations == 2 and found.best.value < found.before
-
-
-def test_what_is_cut_has_wide_necks_and_round_corners(design):
-    """A notch of 20 x 5 mm in a flange of 15 mm leaves 10 mm; 12 mm are asked for, and a tool."""
-    part = make_part(design(frame), Curves(0.003))
-    drawn = part.outline.polygon
-    top = max(drawn.interiors[0].coords, key=lambda place: place[1])[1]
-    x = sum(drawn.interiors[0].bounds[::2]) / 2.0
-    notched = drawn.difference(shapely.box(x - 0.01, top - 0.005, x + 0.01, top + 0.005))
-    outline = replace(part.outline, polygon=notched)
-    assert narrowest_within(notched, 0.005).size == pytest.approx(0.010, abs=2e-4)
-    found = cut(outline, [], 0.012)
-    assert narrowest_within(found.polygon, 0.005).size >= 0.99 * 0.012
-    assert found.polygon.covers(notched) and found.area < notched.area + 20.0 * 3.0 * 1e-6
-
-    def left(polygon):  # by a disc of the tool's size from without, 10 um deep and more
-        closed = polygon.buffer(0.003, quad_segs=64).buffer(-0.003, quad_segs=64)
-        return closed.difference(polygon).buffer(-5e-6).area
-
-    assert left(found.polygon) == 0.0 < left(notched)
-
-
-def test_short_free_curves_stay(design):
-    """Of a free run between two corners 20 um apart nothing can move: both of its ends stay."""
-    part = make_part(design(frame))
-    first, *others = part.shape.loops[1]  # a spline, and along the passive end arc, line, arc
-    assert isinstance(first.curve, Spline)
-    small, rest = first.curve.part(0.0, 2e-4), first.curve.part(2e-4, 1.0)
-    along = rest.points[1] - rest.points[0]
-    rest.points[1] += 0.2 * np.array([-along[1], along[0]])  # a convex corner of the hole
-    loop = (replace(first, curve=small), replace(first, curve=rest), *others)
-    shape = replace(part.shape, loops=(part.shape.loops[0], loop, *part.shape.loops[2:]))
-    found = free_outline(replace(part, shape=shape))
-    assert found.is_valid
-    lengths = [np.linalg.norm(np.diff(run.points, axis=0), axis=1).sum() for run in found.runs]
-    assert min(lengths) > part.domain.cell
-    assert sum(isinstance(one, int) for one in found.loops[1]) == 1
 
 
 class KilledError(Exception):
@@ -232,7 +171,8 @@ def test_killed_search_goes_on(made):
     assert end.done == STEPS and end.ending == found.best.ending
     lines.clear()
     known = optimize_parts(scene, parts, STEPS, lines.append, known=again[-1])
-    assert not lines and known.best.value == pytest.approx(found.best.value, rel=1e-9)
+    # Meshes are finer where the judge found stress to be largest.
+    assert not lines and known.best.value == pytest.approx(found.best.value, rel=1e-5)
 
 
 def test_command_goes_on(tmp_path, monkeypatch):
@@ -292,22 +232,24 @@ def test_command_writes_optimised_parts(made, tmp_path, capsys):
     assert row["optimised part"] == pytest.approx(found.best.value, rel=2e-2)
 
 
-@pytest.mark.slow
-def test_flanges_that_would_buckle_are_kept(tmp_path):
-    """The lightest frame of polymer within its deflection would buckle at 1.6 times its load."""
-    soft = ("material.young_modulus=2e9", "objective.kind=mass", "constraints.deviation=0.3")
+def test_flanges_that_would_buckle_are_kept(made):
+    """Two steps to less mass: a frame of polymer buckles earlier, or later where that is asked."""
+    _, scene, parts, _, _ = made
+    soft = with_tables(scene, material={"young_modulus": 2e9}, objective={"kind": "mass"},
+                       design={"volume_fraction": None})  # fmt: skip
     found = {}
-    for least in (0.01, 1.7):
-        told = (*SMALL, *soft, f"constraints.buckling={least}")
-        folder = folder_with(tmp_path / f"run{least}", frame, *told)
-        scene = scene_of(folder)
-        one = optimize_parts(scene, make_parts(scene, folder), 5, lambda line: None)
-        found[least] = one.best.value, {limit.name: limit.value for limit in one.best.limits}
-    assert found[0.01][1]["buckling"] < 1.6
-    mass, limits = found[1.7]
-    assert 1.7 * (1.0 - EXCESS) <= limits["buckling"] < 1.75
-    assert limits["deviation"] < 0.3
-    assert found[0.01][0] < 0.99 * mass
+    for least in (0.2, 1.9):
+        limits = {"deviation": 0.3, "buckling": least}
+        problem = Problem(with_tables(soft, constraints=limits), {}, {})
+        search = SidesSearch(problem, problem.evaluated({0: _free(scene, 0, parts[0])}, {}))
+        states = [search.state]
+        search.run(2, lambda line: None, 0)
+        states.append(search.state)
+        found[least] = [
+            next(limit.value for limit in one.limits if limit.name == "buckling") for one in states
+        ]
+    assert found[0.2][1] < 0.9 * found[0.2][0]
+    assert found[1.9][1] > 1.05 * found[1.9][0]
 
 
 SCARA = str(runs.ROOT / "demos" / "scara.toml")
@@ -343,36 +285,12 @@ def test_cutter_and_smallest_member_of_a_scara_robot(scara):
     """Every concave corner takes the 6 mm cutter, and no member is thinner than 4 mm."""
     scene, parts = scara
     found = optimize_parts(scene, parts, 2, lambda line: None)
-    assert found.best.value < 0.995 * found.before  # two steps: 0.991
-    assert all(limit.met for limit in found.best.limits)
+    assert found.best.value < 0.995 * found.before and all(one.met for one in found.best.limits)
     size = 1e-4
     for part in found.parts.values():
         assert part.thinnest >= 0.99 * scene.part.minimum_member  # steps end a little within
         deep, _ = deepest_left(part.shape, scene.part.tool_radius, size)
         assert deep <= 1.5 * size  # the raster's own
-
-
-def test_corners_at_the_arms_own_edge_have_no_hooks(design):
-    """Levels of a density turn there in the last cell; what is optimised comes straight to it."""
-
-    def wedges(x, y):
-        return np.abs(y) < 0.002 + 0.5 * np.minimum(x, 1.0 - x)
-
-    part = make_part(design(wedges))
-    outline, cell = free_outline(part), part.domain.cell
-    ends = [
-        run.points[:: -1 if last else 1]
-        for run in outline.runs
-        for last in (False, True)
-        if run.corners[last] and abs(abs(run.points[-last, 1]) - 0.03) < 1e-9
-    ]
-    assert len(ends) == 4
-    for points in ends:
-        reach = np.linalg.norm(points - points[0], axis=1)
-        along = points[np.argmax(reach > cell)] - points[0]
-        assert abs(along[1] / along[0]) == pytest.approx(0.5, rel=0.2)
-        off = np.cross(points[reach < cell] - points[0], along / np.linalg.norm(along))
-        assert np.abs(off).max() < 0.05 * cell
 
 
 def test_trusses_between_bores_have_their_material_there(scara):
@@ -385,7 +303,7 @@ def test_trusses_between_bores_have_their_material_there(scara):
         ends = np.concatenate([piece.curve.at(np.linspace(0.0, 1.0, 9)) for piece in shape.pieces])
         ring = 0.4 * 0.5 * arm.height + scene.arms[k].passive
         assert ends[:, 0].min() > -1.1 * ring
-        assert free_outline(first[k]).is_valid
+        assert first[k].shape.is_simple(1e-6)
         assert len(second[k].shape.loops) > len(shape.loops)  # one bay more
 
 
@@ -404,8 +322,7 @@ def truss(request, tmp_path_factory):
 
 def test_truss_has_interfaces_and_area_of_the_part(truss):
     part, made = truss
-    # `make_shape` moves the curves until the area is that of the densities.
-    assert made.shape.area == pytest.approx(part.domain.volume, rel=1e-6)
+    assert made.shape.area == pytest.approx(part.domain.volume, rel=1e-3)
     ends, others = (
         sorted((p.label, *p.curve.start, *p.curve.end) for p in one.shape.pieces if p.label)
         for one in (part, made)
@@ -419,24 +336,6 @@ def test_number_of_a_truss_is_another_length_of_bays(truss):
     part, made = truss
     holes = [len(trusses_of({0: part}, k)[0].shape.loops) for k in range(3)]
     assert len(set(holes)) == 3 and holes[0] == len(made.shape.loops)
-
-
-def test_part_without_a_strut_has_a_hole_less(truss):
-    """Of a frame with three between holes whose curves are all free, on the mirror's axis."""
-    outline = free_outline(truss[0])
-    wide = replace(outline, least=(0.03, 0.0))  # m: so that its struts count as thin
-    struts = struts_of(wide)
-    assert len(struts) == 3
-    first = struts[0]
-    others = [one for one in struts[1:] if one.beside.isdisjoint(first.beside)]
-    for gone in ([first], [first, *others[:1]]):
-        left = without(outline, gone)
-        assert len(left.shape.loops) == len(outline.shape.loops) - len(gone)
-        assert left.is_valid and left.shape.area < outline.shape.area - 1e-4 * len(gone)  # m2
-        if outline.partner is not None:
-            points = np.vstack([one.points for one in left.runs])
-            apart = np.linalg.norm(points[:, None] - points * MIRROR, axis=2).min(axis=1)
-            assert apart.max() < 1e-9
 
 
 def test_truss_of_thick_members_is_heavier_than_a_part_of_thin_ones(truss):

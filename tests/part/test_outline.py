@@ -5,7 +5,6 @@ import pytest
 import shapely
 from mpi4py import MPI
 from parts import frame
-from scipy.spatial import cKDTree
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
@@ -16,14 +15,9 @@ from dolfinopt.part.plane import outline
 from dolfinopt.part.plane.curves import (
     Arc,
     Line,
-    Piece,
-    Shape,
     Spline,
-    Target,
     curvature,
     direction,
-    fit,
-    joined,
     sampled,
 )
 from dolfinopt.part.plane.outline import draw_outline, search
@@ -38,10 +32,10 @@ BORES = (f"arms.0.mesh={mesh_folder() / 'arm_bores.geo'}", "arms.0.mesh_size=0.0
 def check(part, holes):
     """Check what every part fulfils."""
     shape, domain = part.shape, part.domain
-    assert shape.area == pytest.approx(domain.volume, rel=1e-5)
+    assert shape.area == pytest.approx(domain.volume, rel=1e-4)
     assert part.outline.area == pytest.approx(domain.volume, rel=5e-3)
-    assert shape.distance <= part.tolerance
-    assert shape.concave_radius >= part.outline.tool_radius - part.tolerance
+    assert part.distance <= domain.cell
+    assert shape.concave_radius >= part.outline.tool_radius - 1e-6
     assert shape.is_simple(0.05 * part.tolerance)
     assert len(shape.loops) == 1 + holes
     for loop in shape.loops:
@@ -50,6 +44,7 @@ def check(part, holes):
         np.testing.assert_allclose(np.roll(ends, 1, axis=0), starts, atol=1e-9)
     areas = [sum(piece.curve.area for piece in loop) for loop in shape.loops]
     assert areas[0] > 0.0 and max(areas[1:], default=-1.0) < 0.0
+    assert not any(isinstance(piece.curve, Spline) for piece in shape.pieces if piece.free)
 
 
 def test_frame(design):
@@ -61,9 +56,8 @@ def test_frame(design):
     corners = sorted(tuple(np.round(curve.start, 12)) for curve in outer)
     assert corners == [(0.0, -0.03), (0.0, 0.03), (1.0, -0.03), (1.0, 0.03)]
     assert sorted(piece.label for piece in part.shape.loops[0]) == ["", "", "inboard", "outboard"]
-    # A curve around each hole; along a passive end its line, and the tool's arcs beside it.
-    assert [len(loop) for loop in part.shape.loops[1:]] == [4, 4, 1, 1]
-    assert part.shape.control_points < 40 * 4
+    # Four sides and four fillets around each hole, or two more by a passive end.
+    assert all(len(loop) in (8, 10, 12) for loop in part.shape.loops[1:])
     # Flanges of 15 mm, struts of 25 mm; the level rounds corners and widens the windows for it.
     assert part.thinnest == pytest.approx(0.015, rel=0.05)
     assert len(part.warnings) == 1 and "blurred" in part.warnings[0]  # densities of cells alone
@@ -74,32 +68,6 @@ def test_concave_corners_have_the_radius_of_the_tool(design, radius):
     part = make_part(design(frame), Curves(radius))
     check(part, holes=4)
     assert radius * 0.98 <= part.shape.concave_radius <= radius + 0.005
-
-
-def test_tolerance_bounds_the_distance_and_sets_the_number_of_points(design):
-    points = []
-    for tolerance in (5e-4, 1e-4, 2e-5):
-        part = make_part(design(frame), Curves(tolerance=tolerance))
-        check(part, holes=4)
-        points.append(part.shape.control_points)
-    assert points[0] <= points[1] <= points[2] < 8 * points[0]
-
-
-def test_lines_and_arcs_on_request(design):
-    part = make_part(design(frame), Curves(arcs=True))
-    check(part, holes=4)
-    assert {type(curve) for curve in part.shape.curves} == {Line, Arc}
-    assert 40 < len(part.shape.curves) < 400
-    for loop in part.shape.loops[1:]:  # smooth all around
-        for before, after in zip(loop, (*loop[1:], loop[0]), strict=True):
-            turn = direction(before.curve, 1.0) @ direction(after.curve, 0.0)
-            assert turn > 1.0 - 1e-6
-    spline = make_part(design(frame))
-    here, there = (
-        shapely.MultiLineString([np.vstack([ring, ring[:1]]) for ring in one.shape.polygons(1e-6)])
-        for one in (part, spline)
-    )
-    assert shapely.hausdorff_distance(here, there) < 2.0 * part.tolerance
 
 
 def diagonal(x, y):
@@ -119,7 +87,7 @@ IN_A_WINDOW = {
 @pytest.mark.parametrize("name", IN_A_WINDOW)
 def test_struts_stay_and_islands_are_dropped(design, name):
     more, holes = IN_A_WINDOW[name]
-    part = make_part(design(lambda x, y: frame(x, y) | more(x, y)))
+    part = make_part(design(lambda x, y: frame(x, y) | more(x, y)), Curves(0.001))
     check(part, holes)
     assert part.outline.islands == (name == "island")
     told = "1 piece without a joint to both interfaces (" in " ".join(part.warnings)
@@ -137,7 +105,7 @@ def test_designs_and_tools_that_are_refused(design):
 def test_full_arm_is_its_own_outline(design):
     part = make_part(design(lambda x, y: np.ones_like(x)))
     assert part.shape.area == pytest.approx(0.06, rel=1e-12)
-    assert len(part.shape.curves) == 4 and part.shape.control_points == 0
+    assert len(part.shape.curves) == 4
 
 
 def test_gray_design_says_what_it_is(design):
@@ -162,8 +130,10 @@ def test_bores_are_exact_and_the_part_is_its_mirror_image(design):
         assert curve.radius == pytest.approx(0.01, abs=1e-9)
     ends = [p.curve for p in part.shape.loops[0] if isinstance(p.curve, Arc)]
     assert [curve.radius for curve in ends] == pytest.approx([0.03, 0.03], abs=1e-9)
-    points = np.vstack(part.shape.polygons(1e-6))
-    assert cKDTree(points).query(points * [1.0, -1.0])[0].max() < 1e-12
+    outer, *holes = part.shape.polygons(1e-7)
+    here = shapely.Polygon(outer, holes)
+    there = shapely.affinity.scale(here, yfact=-1.0, origin=(0.0, 0.0))
+    assert here.symmetric_difference(there).area < 1e-6 * here.area
 
 
 def test_regions_stay_solid_and_void(design):
@@ -212,8 +182,7 @@ def test_tapered_arm_with_a_boss_from_step(design, tmp_path):
     exact = [p.curve for p in part.shape.loops[0] if not p.free]
     slopes = [np.subtract(*c.at(np.array([1.0, 0.0]))) for c in exact if isinstance(c, Line)]
     assert [abs(y / x) for x, y in slopes] == pytest.approx([0.01] * len(slopes), abs=1e-6)
-    # The ends, and the ring of 6 mm around the larger bore.
-    assert {round(c.radius, 8) for c in exact if isinstance(c, Arc)} == {0.04, 0.02, 0.021}
+    assert {round(c.radius, 8) for c in exact if isinstance(c, Arc)} >= {0.04, 0.02}
 
 
 @pytest.mark.parametrize(
@@ -364,69 +333,3 @@ def test_curves_do_not_go_beyond_a_label():
 def test_sides_are_chained_to_loops():
     found = loops(np.array([[0, 1], [5, 6], [1, 2], [6, 7], [2, 0], [7, 5]]))
     assert sorted(sorted(loop.tolist()) for loop in found) == [[0, 1, 2], [5, 6, 7]]
-
-
-def wave(count=400):
-    x = np.linspace(0.0, 1.0, count)
-    return np.stack([x, 0.05 * np.sin(2.0 * np.pi * 2.0 * x)], axis=1)
-
-
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4])
-def test_spline_keeps_the_tolerance_with_few_points(tolerance):
-    found = fit(Target(wave()), tolerance)
-    line = shapely.LineString(fine(found)[::10])
-    assert shapely.distance(shapely.points(wave(1500)), line).max() <= 1.01 * tolerance
-    # Cubic: the fourth root of the tolerance; 8, 11 and 19 control points.
-    assert len(found.points) <= 2 + 2.0 * tolerance**-0.25
-    np.testing.assert_array_equal([found.start, found.end], wave()[[0, -1]])
-
-
-def test_directions_at_the_ends_are_kept():
-    first, last = np.array([0.6, 0.8]), np.array([0.8, 0.6])
-    found = fit(Target(wave(), first, last), 1e-3)
-    np.testing.assert_allclose(direction(found, 0.0), first, atol=1e-9)
-    np.testing.assert_allclose(direction(found, 1.0), last, atol=1e-9)
-
-
-def window(radius, stays=()):
-    """Return a hole of two waves and two arcs; pieces with the numbers in `stays` are not free."""
-    points = [[-1, radius], [-0.7, radius], [0.1, radius + 0.3], [0.6, radius], [1, radius]]
-    wave = Spline(np.array([0, 0, 0, 0, 0.4, 1, 1, 1, 1]), np.array(points))
-    right = Arc(np.array([1.0, 0.0]), radius, 0.5 * np.pi, -np.pi)
-    left = Arc(np.array([-1.0, 0.0]), radius, 1.5 * np.pi, -np.pi)
-    curves = [wave, right, Spline(wave.knots, -wave.points), left]
-    return Shape((tuple(Piece(one, free=k not in stays) for k, one in enumerate(curves)),))
-
-
-def test_free_curves_that_go_on_smoothly_are_one_spline():
-    shape = window(0.2)
-    [[piece]] = joined(shape).loops
-    curve = piece.curve
-    np.testing.assert_allclose(curve.start, curve.end, atol=1e-15)
-    assert curve.area == pytest.approx(shape.area, rel=1e-6)
-    boundary = shapely.LinearRing(shape.polygons(1e-7)[0])
-    apart = shapely.distance(shapely.points(fine(curve)), boundary)
-    assert apart.max() < 4.3e-6 * 0.2 + 1e-7  # arcs as cubics; chords of the polygon
-    # The speed is continuous, and the splines are themselves: any derivative is theirs.
-    t = curve.breaks[1:-1]
-    before, after = (curve.derivative(t + d) for d in (-1e-9, 1e-9))
-    np.testing.assert_allclose(before, after, rtol=1e-6, atol=1e-6)
-    share = curve.breaks[2]  # of the first spline, which has two polynomials
-    own = shape.loops[0][0].curve
-    for order in (1, 2):
-        found = curve.derivative(0.3 * t[1:2], order) * share**order
-        np.testing.assert_allclose(found, own.derivative([0.3], order), rtol=1e-9)
-    half = curve.part(0.1, 0.8)  # double knots within
-    at = np.linspace(0.0, 1.0, 50)
-    np.testing.assert_allclose(half.at(at), curve.at(0.1 + 0.7 * at), atol=1e-12)
-
-
-def test_corners_and_what_stays_part_curves():
-    corner = window(0.2)
-    loop = list(corner.loops[0])
-    loop[0].curve.points[1] += [0.0, 0.05]  # no longer level where the left arc ends
-    assert len(joined(corner).curves) == 1  # the hole begins and ends there
-    loop[0].curve.points[-2] += [0.0, 0.05]
-    assert len(joined(corner).curves) == 2
-    kept = joined(window(0.2, stays=(0,)))  # the arcs beside it are the tool's, and exact
-    assert [type(piece.curve) for piece in kept.pieces] == [Spline, Arc, Spline, Arc]

@@ -21,6 +21,7 @@ from dolfinopt.arms.arm import build_arms
 from dolfinopt.cli.shared import scene_of
 from dolfinopt.parallel import partition_arms
 from dolfinopt.part.part import Curves, make_parts
+from dolfinopt.part.stress import HOT
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.sensitivity import static_response
 from dolfinopt.scene.load import read_scene
@@ -66,7 +67,7 @@ def peak(part, state):
     column = state.load_fields.V.shape[2] + ACROSS
     stress = np.linalg.norm(points.A[:, :, column], axis=0) * (points.weights > 0.0)
     stress *= np.abs(points.places[:, 0] - 0.5) < 0.5 - AWAY
-    return stress.max(), points.places[stress > 0.8 * stress.max()]
+    return stress.max(), points.places[stress > HOT * stress.max()]
 
 
 def meshed(file, around, largest, plane=True):

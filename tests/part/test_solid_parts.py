@@ -90,6 +90,8 @@ def test_part_of_a_solid(domain_with, density):
     domain = domain_with(density)
     part = make_solid_part(domain)
     assert part.watertight
+    told = [one for one in part.warnings if "closed cavities at (250.0, " in one]
+    assert len(part.cavities) == len(told) == (density is hollow)
     assert part.volume == pytest.approx(domain.volume, rel=1e-4)
     assert 0.01 * domain.cell < part.distance <= 0.5 * domain.cell
     data = triangle_bytes(MM * part.surface.corners, "part, mm")
@@ -509,7 +511,7 @@ def test_model_makes_and_checks_solid_parts(checked, monkeypatch, tmp_path):
 def test_options_of_outlines_are_refused_for_solids(tmp_path):
     folder = finished(tmp_path / "run", (hollow,), "arms.cells=[16,4,4]", "arms.link2.rigid=true")
     with pytest.raises(InputError, match="varies over the thick"):
-        run("part", folder, "--curves=arcs")
+        run("part", folder, "--round")
     assert not (folder / "part").exists()
 
 

@@ -8,27 +8,18 @@ two holes that come close to each other: without it these two are one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import brentq
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.part.plane.curves import MIRROR
-from dolfinopt.part.plane.free_outline import (
-    CHORD,
-    SPACING,
-    FreeOutline,
-    Run,
-    fitted_closed,
-    mirrored,
-)
+from dolfinopt.part.plane.fit import fitted_sides
+from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.outline import polygons_of
 from dolfinopt.part.plane.part import PlanePart
-from dolfinopt.part.plane.trace import make_shape
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
@@ -42,12 +33,7 @@ FILLET = 0.8  # radius of a truss's concave corners, cells
 FEWEST = 2  # bays of the first truss; every further one of a short arm has one more
 SMALLEST_HOLE = 4.0  # area of a hole that is worth its outline, squared cells
 AREA = 1e-3  # relative: of a truss
-# Distances of its curves from straight struts, cells, tried in turn: they will move anyway.
-CLOSE = 0.1, 0.05, 0.2
-SLENDER = 1.6  # width of struts that may go, over the least width of members
-WIDER = 1.3, 1.8, 2.5  # width that joins two holes over the distance between them, tried in turn
-CUSP = 4.0  # radius to which cusps where struts have ended are cut back, cells
-MOST = 0.5  # of a hole's area that may be added where two are joined
+CLOSE = 0.2  # distance of its sides from the polygon, cells
 
 
 def trusses_of(parts: Mapping[int, PlanePart], number: int) -> dict[int, PlanePart]:
@@ -77,12 +63,15 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     arm, span = _between_bores(arm, stays, domain.cell)
     fillet = max(FILLET * domain.cell, drawn.tool_radius)
 
-    def polygon(flange: float) -> Polygon:
+    least = SMALLEST_HOLE * domain.cell**2
+
+    def rounded(hole: Geometry) -> Geometry:
+        return hole.buffer(-fillet, quad_segs=32).buffer(fillet, quad_segs=32)
+
+    def polygon(flange: float, rounds: bool = True) -> Polygon:
         widths = flange, max(STRUT * flange, domain.minimum_member)
-        holes = _windows(arm, stays, span, widths, slope, fewest, domain.symmetric)
-        rounded = holes.buffer(-fillet, quad_segs=32).buffer(fillet, quad_segs=32)
-        least = SMALLEST_HOLE * domain.cell**2
-        kept = [one for one in polygons_of(rounded) if one.area > least]
+        holes = polygons_of(_windows(arm, stays, span, widths, slope, fewest, domain.symmetric))
+        kept = [rounded(one) if rounds else one for one in holes if rounded(one).area > least]
         return max(polygons_of(arm.difference(shapely.union_all(kept))), key=lambda one: one.area)
 
     def missing(flange: float) -> float:
@@ -95,17 +84,16 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     excess, flange = missing(thin), thin
     if excess <= 0.0:
         flange = brentq(missing, thin, thick, xtol=AREA * domain.cell)
-    found = replace(drawn, polygon=polygon(flange), islands=0, islands_area=0.0, filled=0)
+    # Sides find their sharp corners, and are rounded there.
+    sharp = polygon(flange, rounds=False)
+    found = replace(drawn, polygon=sharp, islands=0, islands_area=0.0, filled=0)
     area = domain.volume * (1.0 + max(excess, 0.0))
-    for close in CLOSE:
-        try:
-            shape = make_shape(found, max(part.tolerance, close * domain.cell), area=area)
-            break
-        except InputError as error:
-            problem = ConvergenceError(str(error))
-    else:
-        raise problem
-    return replace(part, outline=found, shape=shape)
+    limits = limits_of_part(domain, drawn.tool_radius)
+    try:
+        sides = fitted_sides(found, limits, CLOSE * domain.cell, area)
+    except InputError as error:
+        raise ConvergenceError(str(error)) from None
+    return replace(part, outline=found, sides=sides)
 
 
 def _between_bores(
@@ -173,97 +161,3 @@ def _extent(inside: Geometry, x: float, low: float, high: float) -> tuple[float,
 
     cut = inside.intersection(shapely.LineString([(x, low), (x, high)]))
     return (low, high) if cut.is_empty else (cut.bounds[1], cut.bounds[3])
-
-
-@dataclass(frozen=True, eq=False)
-class Strut:
-    """What lies between two holes; of symmetric arms with its mirror image.
-
-    Attributes:
-        beside: numbers of the runs of these holes.
-        holes: in their place where it is left out.
-    """
-
-    beside: frozenset[int]
-    holes: tuple[Polygon, ...]
-
-
-def struts_of(outline: FreeOutline) -> list[Strut]:
-    """Return the struts that may be left out, the thinnest first."""
-    import shapely
-
-    rings = outline.shape.polygons(CHORD * outline.part.domain.cell)
-    holes = {
-        number: shapely.Polygon(rings[k])
-        for k, loop in enumerate(outline.loops)
-        for number in loop
-        if isinstance(number, int) and outline.runs[number].closed
-    }
-    twin = {k: k for k in holes} if outline.partner is None else _twins(holes)
-    found: dict[frozenset[int], Strut] = {}
-    for width, a, b in sorted(
-        (holes[a].distance(holes[b]), a, b) for a, b in combinations(holes, 2)
-    ):
-        pairs = {frozenset((a, b)), frozenset((twin[a], twin[b]))}
-        beside = frozenset[int]().union(*pairs)
-        if width > SLENDER * outline.least[0] or len(beside) < 2 * len(pairs):
-            continue  # wide, or it shares a hole with its image
-        made = [_joined([holes[k] for k in pair], width, outline) for pair in pairs]
-        if beside not in found and all(made):
-            found[beside] = Strut(beside, tuple(one for one in made if one is not None))
-    return list(found.values())
-
-
-def _twins(holes: Mapping[int, Polygon]) -> dict[int, int]:
-    """Return the mirror image of every hole about y = 0."""
-    centre = {k: np.array(one.centroid.coords[0]) for k, one in holes.items()}
-    return {
-        k: min(centre, key=lambda j: float(np.linalg.norm(centre[j] * MIRROR - here)))
-        for k, here in centre.items()
-    }
-
-
-def _joined(holes: Sequence[Polygon], width: float, outline: FreeOutline) -> Polygon | None:
-    """Return the hole without the strut between two; None where what is between is none."""
-    import shapely
-
-    cell = outline.part.domain.cell
-    both = shapely.union_all(holes)
-    tool = max(outline.part.outline.tool_radius, 0.5 * cell)
-    for wider in WIDER:
-        reach = 0.5 * wider * width
-        hole = both.buffer(reach, quad_segs=16).buffer(-reach, quad_segs=16)
-        hole = hole.buffer(-tool, quad_segs=16).buffer(tool, quad_segs=16)
-        # What is left of the strut's ends are cusps between the two.
-        hole = hole.buffer(CUSP * cell, quad_segs=16).buffer(-CUSP * cell, quad_segs=16)
-        added = hole.area - both.area
-        if hole.geom_type == "Polygon" and not hole.interiors:
-            return hole if added < MOST * min(one.area for one in holes) else None
-    return None
-
-
-def without(outline: FreeOutline, struts: Sequence[Strut]) -> FreeOutline:
-    """Return the outline without struts of which none shares a hole with another."""
-    import shapely
-
-    cell, symmetric = outline.part.domain.cell, outline.part.domain.symmetric
-    if not struts:
-        return outline
-    gone = {k for one in struts for k in one.beside}
-    kept = [k for k in range(len(outline.runs)) if k not in gone]
-    number = {k: i for i, k in enumerate(kept)}
-    loops = [
-        tuple(number[one] if isinstance(one, int) else one for one in loop)
-        for loop in outline.loops
-        if not gone & {one for one in loop if isinstance(one, int)}
-    ]
-    runs = [outline.runs[k] for k in kept]
-    for hole in (hole for one in struts for hole in one.holes):
-        loops.append((len(runs),))
-        ring = np.asarray(shapely.geometry.polygon.orient(hole, -1.0).exterior.coords)[:-1]
-        runs.append(Run(fitted_closed(ring, SPACING * cell, symmetric), True))
-    partner = None
-    if outline.partner is not None:
-        runs, partner = mirrored(runs)
-    made = replace(outline, loops=tuple(loops), runs=tuple(runs), partner=partner)
-    return made.rounded()

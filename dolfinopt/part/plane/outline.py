@@ -89,29 +89,32 @@ def _step(tried: list[tuple[float, float]], slope: float) -> float:
     return BEYOND * excess / slope
 
 
+NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
+SMALLEST_STUB, SPECK = (
+    0.25,
+    8.0,
+)  # area of a stub at least, and of its thicker end at most, squared widths
 QUADRANT = 12  # sides of a quarter of a disc
 SAGITTA = 0.02  # of the polygons in place of the tool's circle, tolerances
 SHALLOW = 0.1  # depth of corners that are left as they are, tolerances
 
 
-def rounded(whole: Geometry, radius: float, chord: float) -> tuple[Geometry, np.ndarray]:
+def rounded(whole: Geometry, radius: float, chord: float) -> Geometry:
     """Return the polygons with all that a disc cannot reach from without added to them.
 
-    Elsewhere their sides stay what they are to the bit. With them points (n, 2), m, the centres of
-    all arcs of the disc among them.
+    Elsewhere their sides stay what they are to the bit.
     """
     import shapely
 
     tolerance = chord / CHORD
     quadrant = max(int(np.ceil(0.25 * np.pi / np.sqrt(2.0 * SAGITTA * tolerance / radius))), 6)
-    swept = whole.buffer(radius, quad_segs=quadrant)
-    closed = swept.buffer(-radius, quad_segs=quadrant)
+    closed = whole.buffer(radius, quad_segs=quadrant).buffer(-radius, quad_segs=quadrant)
     added = shapely.get_parts(closed.difference(whole))
     # The rounding of numbers, and every corner of the polygon, leave slivers all along.
     added = added[shapely.area(added) > (SHALLOW * tolerance) ** 2]
     deep = shapely.area(shapely.buffer(added, -0.5 * SHALLOW * tolerance, quad_segs=2)) > 0.0
     added = shapely.buffer(added[deep], 0.1 * chord, join_style="mitre")
-    return shapely.union_all([whole, *added]), shapely.get_coordinates(swept)
+    return shapely.union_all([whole, *added])
 
 
 def without_necks(whole: Geometry, width: float, chord: float) -> Geometry:
@@ -258,7 +261,7 @@ LEAP = 5e-3  # relative: what the curves make up for where a piece joins or leav
 CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
 STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
 ROUGH = 0.01  # the same while a level is looked for roughly, cells
-TOOL = 0.2  # default radius of the tool, cells
+TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
 # Material along an interface that the design leaves void, in cells: the interface is rigid.
 STRIP = 0.5
 # Width of members that the design has and the level has not, in cells: solid cells that share a
@@ -270,7 +273,6 @@ NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must
 # Corners in which solid cells touch, over solid cells, from which on a design is a checkerboard:
 # one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.08.
 CHECKERED, FEW = 0.4, 100
-ROUNDING = 1.0  # by which concave corners are rounder than the tool, tolerances
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,7 +288,6 @@ class Outline:
         chord: distance of its sides from the arm's own curves, m.
         islands, islands_area: number of pieces that join no interface and were dropped; m2.
         filled: number of holes narrower than the tool, closed.
-        centres: (n, 2) m, those of the tool's arcs on the polygon among them.
     """
 
     domain: Domain
@@ -298,17 +299,6 @@ class Outline:
     islands: int
     islands_area: float
     filled: int
-    centres: np.ndarray
-
-    @property
-    def tolerance(self) -> float:
-        """Of the part, m."""
-        return self.chord / CHORD
-
-    @property
-    def rounding(self) -> float:
-        """Radius of its concave corners, m: curves within the tolerance may turn sharper."""
-        return _rounding(self.tool_radius, self.chord)
 
     @property
     def area(self) -> float:
@@ -327,13 +317,9 @@ class _Given:
     outboard: Geometry  # lines of the interface
 
 
-def _rounding(tool: float, chord: float) -> float:
-    return tool + ROUNDING * chord / CHORD
-
-
 def default_tool(domain: Domain) -> float:
     """Return the tool's radius where none is asked for, m."""
-    return TOOL * domain.cell
+    return min(TOOL, SLIM * domain.height)
 
 
 def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outline:
@@ -370,8 +356,7 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
 
     if target > given.arm.area * (1.0 - AREA):
         polygon = max(polygons_of(given.arm), key=lambda p: p.area)
-        chord, none = CHORD * tolerance, np.empty((0, 2))
-        return Outline(domain, polygon, 0.0, 0.0, tool_radius, chord, 0, 0.0, 0, none)
+        return Outline(domain, polygon, 0.0, 0.0, tool_radius, CHORD * tolerance, 0, 0.0, 0)
     if float(np.ptp(domain.field)) < UNIFORM:
         raise InputError(
             f"{where}: its density is {domain.field.mean():.3g} everywhere, which has no outline; "
@@ -453,10 +438,9 @@ def _at(
     import shapely
 
     whole = _material(given, raster, level, offset, STRAIGHT * chord / CHORD)
-    before, centres = polygons_of(whole), np.empty((0, 2))
+    before = polygons_of(whole)
     if tool > 0.0:
-        whole, centres = rounded(whole, _rounding(tool, chord), chord)
-        whole = whole.intersection(given.arm)
+        whole = rounded(whole, tool, chord).intersection(given.arm)
     whole = without_necks(whole, NECK * chord / CHORD, chord)
     parts = polygons_of(whole)
     near = 1e-6 * domain.extent
@@ -476,7 +460,6 @@ def _at(
         islands=len(dropped),
         islands_area=float(sum(p.area for p in dropped)),
         filled=max(closed - len(holes), 0),
-        centres=centres,
     )
 
 
@@ -531,3 +514,42 @@ def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline
         lambda offset: at(found.level, offset), _excess, 0.0, slope, (-most, most), CLOSE
     )
     return min(found, moved, key=_off)
+
+
+def without_stubs(outline: Outline, width: float) -> Outline:
+    """Return an outline without members narrower than `width`, m, that end nowhere.
+
+    A narrow piece stays where it joins two places of what is wider, or lies in what must stay.
+    """
+    import shapely
+
+    polygon, near = outline.polygon, NEAR_STUB * width
+    stays = _given(outline.domain, outline.chord).stays.intersection(polygon)
+    wide = polygon.buffer(-0.5 * width).buffer(0.5 * width, quad_segs=QUADRANT)
+    cores = polygons_of(wide)
+    narrow = polygons_of(polygon.difference(wide.buffer(near)))
+    members = [one.buffer(2.0 * near) for one in narrow if one.area > SMALLEST_STUB * width**2]
+    core = max(cores, key=lambda one: one.area, default=shapely.Polygon())
+    dropped: list[Geometry] = []
+    while True:
+        whole = shapely.union_all(cores)
+        loose = [
+            one
+            for one in members
+            if not one.interiors and len(polygons_of(one.intersection(whole))) == 1
+        ]
+        members = [one for one in members if one not in loose]
+        ends = shapely.union_all(members)
+        alone = [
+            one
+            for one in cores
+            if one is not core
+            and len(polygons_of(ends.intersection(one))) < 2
+            and one.area < width * SPECK * width
+        ]
+        cores = [one for one in cores if one not in alone]
+        if not loose and not alone:
+            break
+        dropped += [*loose, *alone]
+    left = polygon.difference(shapely.union_all(dropped)).union(stays)
+    return replace(outline, polygon=max(polygons_of(left), key=lambda one: one.area))

@@ -4,29 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dolfinopt.density.measured import GREY
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
-from dolfinopt.part.mesh import BodyMesh, body_mesh
+from dolfinopt.part.mesh import FINE, TURN, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
-from dolfinopt.part.plane.outline import (
-    Outline,
-    default_tool,
-    draw_outline,
-    polygons_of,
-    rounded,
-)
-from dolfinopt.part.plane.simplify import simple_shape
-from dolfinopt.part.plane.trace import make_shape
+from dolfinopt.part.plane.fit import distance, fitted_sides
+from dolfinopt.part.plane.limits import THIN, limits_of_part, rounded_radii
+from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
+from dolfinopt.part.plane.sides import Sides
 from dolfinopt.part.stress import corner_stress_in_plane, is_regular_in_plane
-from dolfinopt.part.widths import TightPlace, narrowest_within, thinnest_member, tight_places
+from dolfinopt.part.widths import TightPlace, thinnest_member, tight_places
 from dolfinopt.part.workshop_files import (
     MM,
     dxf_text,
@@ -45,12 +39,9 @@ if TYPE_CHECKING:
 
 
 TOLD = 5  # tight places that a sentence names
-SIMPLE = 0.25  # distance of simplified outlines by default, cells
 SAME_AREA, QUARTERS = 1e-4, 6  # relative, of chords to their curves; of the chords' distance
-DISCS, ROUND = 20, 64  # that widen necks, at most; sides of a quarter of one
-ROUGH = 0.002  # distance of polygons in which necks are looked for, cells
-NARROW = 0.99  # share of the smallest member below which a neck is widened
-TOLERANCE, CELLS = 1e-4, 0.1  # default: the smaller of 0.1 mm and a tenth of a cell
+TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
+AWAY = 0.5  # cells that sides may lie from the outline by default
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,16 +51,14 @@ class PlanePart:
     Attributes:
         domain: the arm and its design.
         outline: its polygon.
-        shape: its curves.
-        tolerance: of the curves, m.
-        kept_splines: whether no straight lines and fillets were found that were asked for.
+        sides: its own outline.
+        tolerance: of the outline's polygon and of chords, m.
     """
 
     domain: Domain
     outline: Outline
-    shape: Shape
+    sides: Sides
     tolerance: float
-    kept_splines: bool = False
 
     COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
@@ -79,6 +68,16 @@ class PlanePart:
     def name(self) -> str:
         """The arm's name."""
         return self.domain.name
+
+    @property
+    def shape(self) -> Shape:
+        """Its curves."""
+        return self.sides.shape
+
+    @cached_property
+    def distance(self) -> float:
+        """Largest distance of its curves from the outline of the densities, m."""
+        return distance(self.sides, self.outline)
 
     @cached_property
     def thinnest(self) -> float | None:
@@ -104,10 +103,10 @@ class PlanePart:
     def sentence(self) -> str:
         """Its size in words."""
         shape = self.shape
-        points = f" with {shape.control_points} control points" if shape.control_points else ""
         return (
-            f"{1e6 * shape.area:.6g} mm2, {len(shape.loops) - 1} holes, {len(shape.curves)} "
-            f"curves{points}, at most {1e3 * shape.distance:.2g} mm from the outline"
+            f"{1e6 * shape.area:.6g} mm2, {len(shape.loops) - 1} holes, {shape.entities}, at most "
+            f"{1e3 * self.distance:.2g} mm from the outline, tool radius "
+            f"{1e3 * self.outline.tool_radius:.3g} mm"
         )
 
     @property
@@ -115,13 +114,7 @@ class PlanePart:
         """What the workshop or the designer should know, a sentence each."""
         one, outline = self.domain, self.outline
         found = []
-        if one.grayness > GREY:
-            found.append(
-                f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
-                "the material is in cells that are neither solid nor void; the part is another "
-                'design than the optimised one; optimise with design.projection = "robust" until '
-                "it is crisp"
-            )
+        found += one.gray_words
         if one.crisp:
             found.append(
                 f"arm {one.name!r}: design.npz does not tell what its densities were projected "
@@ -134,11 +127,6 @@ class PlanePart:
                 f"arm {one.name!r}: {number} without a joint to both interfaces "
                 f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
             )
-        if self.kept_splines:
-            found.append(
-                f"arm {one.name!r}: --simplify: no straight lines and fillets without crossings; "
-                "splines instead; choose a smaller --tolerance"
-            )
         if self.tight:
             listed = "; ".join(map(str, self.tight[:TOLD]))
             more = f"; {len(self.tight) - TOLD} more in part.json" if len(self.tight) > TOLD else ""
@@ -146,10 +134,11 @@ class PlanePart:
             found.append(
                 f"arm {one.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
             )
-        if self.thinnest is not None and self.thinnest < 0.9 * one.minimum_member:
+        least = one.minimum_member or THIN
+        if self.thinnest is not None and self.thinnest < 0.9 * least:
             found.append(
                 f"arm {one.name!r}: its thinnest neck is {1e3 * self.thinnest:.3g} mm wide, below "
-                f"the smallest that the scene asks for, {1e3 * one.minimum_member:.3g} mm"
+                f"the smallest that is asked for, {1e3 * least:.3g} mm"
             )
         return found
 
@@ -167,10 +156,9 @@ class PlanePart:
             "mass": density * self.volume,
             "design_volume": one.volume * one.thickness,
             "level": self.outline.level,
-            "distance": shape.distance,
+            "distance": self.distance,
             "tolerance": self.tolerance,
             "curves": len(shape.curves),
-            "control_points": shape.control_points,
             "loops": len(shape.loops),
             "tool_radius": self.outline.tool_radius,
             "smallest_concave_radius": radius if math.isfinite(radius) else None,
@@ -197,10 +185,16 @@ class PlanePart:
         yield ".svg", svg_text(shape, title)
         yield ".stl", triangle_bytes(MM * self.facets, f"{title}, mm")
 
-    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> BodyMesh:
-        """Return triangles along its curves, see `part.Part`."""
+    def mesh(
+        self,
+        coarser: float = 1.0,
+        finer: Sequence[np.ndarray] | None = None,
+        turn: float | np.ndarray = TURN,
+    ) -> BodyMesh:
+        """Return triangles along its curves, see `part.Part`; `turn` as of `body_mesh`."""
+        turn = FINE if finer is None else turn
         try:
-            return body_mesh(self.shape, self.domain.cell, coarser, finer)
+            return body_mesh(self.shape, self.domain.cell, coarser, finer or (), turn)
         except InputError as error:
             raise InputError(f"arm {self.name!r}: {error}") from None
 
@@ -232,61 +226,19 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
 
 def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
     """Return the part of one arm, see `part.make_parts`."""
-    tool_radius, tolerance = curves.tool_radius, curves.tolerance
-    if tolerance is None:
-        tolerance = min(TOLERANCE, CELLS * domain.cell)
-    elif tolerance > domain.cell:
+    away = AWAY * domain.cell if curves.tolerance is None else curves.tolerance
+    if away > domain.cell:
         raise InputError(
-            f"--tolerance = {tolerance:g} m: expected at most a cell of arm {domain.name!r}, "
+            f"--tolerance = {away:g} m: expected at most a cell of arm {domain.name!r}, "
             f"{domain.cell:.3g} m"
         )
-    tool = default_tool(domain) if tool_radius is None else tool_radius
-    fine = min(tolerance, TOLERANCE, CELLS * domain.cell) if curves.simplify else tolerance
-    outline = draw_outline(domain, tool, fine)
-    if curves.simplify:
-        distance = SIMPLE * domain.cell if curves.tolerance is None else tolerance
-        shape = simple_shape(outline, distance, domain.volume)
-        if shape is not None:
-            return PlanePart(domain, outline, shape, fine)
-    shape = make_shape(outline, fine, curves.arcs)
-    return PlanePart(domain, outline, shape, fine, curves.simplify)
-
-
-def cut(outline: Outline, centres: Sequence[np.ndarray], least: float) -> Outline:
-    """Return an outline whose necks are wide enough, and its concave corners round, by material.
-
-    Necks get discs as wide as the smallest member, corners that the tool does not reach are filled.
-
-    Args:
-        outline: as drawn.
-        centres: of arcs of the tool that it has already, m.
-        least: smallest width of members, m.
-    """
-    import shapely
-
-    domain, chord = outline.domain, outline.chord
-    arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
-    polygon, inner = outline.polygon, arm.buffer(-0.5 * least)
-    for _ in range(DISCS):
-        rough = polygon.simplify(ROUGH * domain.cell)
-        narrow = narrowest_within(rough, domain.cell, NARROW * least)
-        if narrow is None or inner.is_empty:
-            break
-        middle = shapely.shortest_line(inner, shapely.Point(narrow.place)).coords[0]
-        disc = shapely.Point(middle).buffer(0.5 * least, quad_segs=ROUND)
-        polygon = polygon.union(disc)
-        if domain.symmetric:
-            polygon = polygon.union(shapely.affinity.scale(disc, yfact=-1.0, origin=(0.0, 0.0)))
-    closed, new = rounded(polygon, outline.rounding, chord)
-    polygon = max(polygons_of(closed.intersection(arm)), key=lambda one: one.area)
-    return replace(outline, polygon=polygon, centres=np.vstack([*centres, new]))
-
-
-def simplified(part: PlanePart, tolerance: float | None = None) -> PlanePart:
-    """Return a part in straight lines and fillets, within a tolerance of it, m, if there are."""
-    distance = SIMPLE * part.domain.cell if tolerance is None else tolerance
-    shape = simple_shape(part.outline, distance, part.shape.area)
-    return replace(part, kept_splines=True) if shape is None else replace(part, shape=shape)
+    tool = default_tool(domain) if curves.tool_radius is None else curves.tool_radius
+    fine = min(away, TOLERANCE, CELLS * domain.cell)
+    outline, limits = draw_outline(domain, tool, fine), limits_of_part(domain, tool)
+    sides = fitted_sides(outline, limits, away, domain.volume)
+    if curves.rounds:
+        sides = rounded_radii(sides, limits)
+    return PlanePart(domain, outline, sides, fine)
 
 
 def _count(number: int, name: str) -> str:

@@ -13,7 +13,7 @@ Source: Lazarov & Sigmund (2011), doi:10.1002/nme.3072.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -26,17 +26,8 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
-from dolfinopt.part.mesh import NEAR, PlateMesh, extruded, facing
-from dolfinopt.part.plane.free_outline import (
-    EDGE_SHARE,
-    LEAST_GAP,
-    LEAST_MEMBER,
-    ROOM_SHARE,
-    WIDTH_SHARE,
-    FreeOutline,
-    free_outline,
-)
-from dolfinopt.part.solid.part import SolidPart, plate_part
+from dolfinopt.part.mesh import NEAR, facing
+from dolfinopt.part.solid.part import SolidPart
 from dolfinopt.part.solid.surface import (
     FURTHER,
     Surface,
@@ -48,6 +39,10 @@ from dolfinopt.part.solid.surface import (
 
 REACH = 1.5  # length r over which moves are smooth, cells of the design
 FLAT = 1e-6  # of a normal, by which facets of one flat face differ, and faces from an axis
+WIDTH_SHARE = 0.2  # of a member's or a gap's width that one side may take in a step
+ROOM_SHARE = 0.45  # of what a member or gap is wider than it must be, likewise
+EDGE_SHARE = 0.9  # of the distance to where material may not be, or must be
+LEAST_MEMBER, LEAST_GAP = 0.75, 0.3  # cells: of members that nobody asks to be wider, of gaps
 STEEP = 0.3  # sine between surface and face from which on the rim between them moves
 NEAREST, WALLS = 400, 60  # places around each that may be the other side; the arm's own faces
 # Worst shape of a cell over that when the mesh was made: a new one is due, or a step goes too far.
@@ -92,19 +87,13 @@ class FreeSurface:
         """The part with this surface."""
         return self.made
 
-    def rounded(self) -> FreeSurface:
-        """Return it as it is: no cutter makes a free-form surface."""
-        return self
-
     def scaled(self, part: SolidPart, factors: np.ndarray) -> FreeSurface:
         """Raise InputError: arms that repeat a solid's design each have their own surface."""
         raise InputError(REPEATED.format(name=part.name))
 
-    def meshed(
-        self, coarser: float, finer: Sequence[np.ndarray] = ()
-    ) -> tuple[FreeSurface, Tetrahedra]:
+    def meshed(self, _: np.ndarray | None = None) -> tuple[FreeSurface, Tetrahedra]:
         """Return the surface with a new mesh, whose nodes are other variables."""
-        mesh = self.made.mesh(coarser)
+        mesh = self.made.mesh()
         return free_surface(self.made, mesh), mesh
 
     def followed(self, _: Tetrahedra) -> Tetrahedra:
@@ -157,8 +146,9 @@ class FreeSurface:
         """Return s = F x (count,), m."""
         return np.asarray(self.frame.filter.solve(self.frame.areas * x))
 
-    def by_x(self, by_s: np.ndarray) -> np.ndarray:
-        """Return derivatives (m, count) by x from those by s."""
+    def by_x(self, _: Tetrahedra, by_nodes: np.ndarray) -> np.ndarray:
+        """Return derivatives (m, count) by x from those (m, n, 3) by the places of all nodes."""
+        by_s = np.array([self._by_s(one) for one in by_nodes])
         return np.asarray(self.frame.filter.solve(by_s.T, "T").T * self.frame.areas)
 
     def moved(self, s: np.ndarray) -> FreeSurface:
@@ -186,17 +176,17 @@ class FreeSurface:
             step[:, a] += follower.followed(step[:, a])
         return replace(self, mesh=replace(self.mesh, points=self.mesh.points + step))
 
-    def by_s(self, _: Tetrahedra, by_nodes: np.ndarray) -> np.ndarray:
+    def _by_s(self, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (count,) by s from those by the places (n, 3) of all nodes."""
         found = np.zeros_like(by_nodes)
         for a, follower in enumerate(self.frame.followers):
             found[:, a] = by_nodes[:, a] + follower.transposed(by_nodes[:, a])
         return np.asarray((found[self.nodes] * self.along).sum(axis=1))
 
-    def size_by_s(self) -> np.ndarray:
-        """Return the derivative (count,) of the volume by s, m2."""
+    def size_by_x(self) -> np.ndarray:
+        """Return the derivative (count,) of the volume by x, m2."""
         vectors = area_vectors(Surface(self.mesh.points, self.mesh.boundary))
-        return self.by_s(self.mesh, vectors)
+        return self.by_x(self.mesh, vectors[None])[0]
 
     @property
     def is_valid(self) -> bool:
@@ -307,116 +297,6 @@ class Frame:
     followers: tuple[Follower, Follower, Follower]
     places: np.ndarray
     carried: sp.csr_matrix
-
-
-@dataclass(frozen=True, eq=False)
-class FreePlate:
-    """The outline of a plate in space, meshed in prisms: variables are those of the outline.
-
-    Attributes:
-        solid: the arm and its design.
-        outline: of the plate.
-    """
-
-    solid: SolidDomain
-    outline: FreeOutline
-
-    STEPS: ClassVar[int] = FreeOutline.STEPS
-
-    @property
-    def part(self) -> SolidPart:
-        """That it was made of."""
-        return plate_part(self.solid, self.outline.part)
-
-    @property
-    def current(self) -> SolidPart:
-        """The part with this outline."""
-        return plate_part(self.solid, self.outline.current)
-
-    @property
-    def made(self) -> SolidPart:
-        """The part with this outline, and what is measured of it."""
-        return plate_part(self.solid, self.outline.made)
-
-    @property
-    def count(self) -> int:
-        """Number of control points."""
-        return self.outline.count
-
-    @property
-    def size(self) -> float:
-        """Volume, m3."""
-        return self.outline.size * self.outline.part.domain.thickness
-
-    @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What `restored` makes it of."""
-        return self.outline.arrays
-
-    def restored(self, arrays: Mapping[str, np.ndarray]) -> FreePlate:
-        """Return the plate of these `arrays`, of one that this has become."""
-        return replace(self, outline=self.outline.restored(arrays))
-
-    @property
-    def is_valid(self) -> bool:
-        """Whether the outline can be that of a part."""
-        return self.outline.is_valid
-
-    def is_worn(self, mesh: PlateMesh) -> bool:
-        """Whether a mesh is to be made anew."""
-        return self.outline.is_worn(mesh.face)
-
-    def filtered(self, x: np.ndarray) -> np.ndarray:
-        """Return s = F x (count,), m."""
-        return self.outline.filtered(x)
-
-    def by_x(self, by_s: np.ndarray) -> np.ndarray:
-        """Return derivatives (m, count) by x from those by s."""
-        return self.outline.by_x(by_s)
-
-    def moved(self, s: np.ndarray) -> FreePlate:
-        """Return the plate with control points moved outwards by s (count,), m."""
-        return replace(self, outline=self.outline.moved(s))
-
-    def room(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far (count,) control points may move inwards and outwards, m."""
-        return self.outline.room()
-
-    def rounded(self) -> FreePlate:
-        """Return the plate with concave corners as wide as the tool."""
-        return replace(self, outline=self.outline.rounded())
-
-    def scaled(self, part: SolidPart, factors: np.ndarray) -> FreePlate:
-        """Raise InputError: arms that repeat a solid's design each have their own outline."""
-        raise InputError(REPEATED.format(name=part.name))
-
-    def meshed(
-        self, coarser: float, finer: Sequence[np.ndarray] = ()
-    ) -> tuple[FreePlate, Tetrahedra]:
-        """Return it with a new mesh; variables stay."""
-        return self, self.current.mesh(coarser, finer)
-
-    def followed(self, mesh: PlateMesh) -> PlateMesh | None:
-        """Return a mesh of a plate nearby, moved to this one; None where it folds."""
-        face = self.outline.followed(mesh.face)
-        if face is None:
-            return None
-        return replace(extruded(face, mesh.thickness, mesh.layers), further=mesh.further)
-
-    def by_s(self, mesh: PlateMesh, by_nodes: np.ndarray) -> np.ndarray:
-        """Return derivatives (count,) by s from those by the places (n, 3) of all nodes."""
-        return self.outline.by_s(mesh.face, mesh.at_face(by_nodes))
-
-    def size_by_s(self) -> np.ndarray:
-        """Return the derivative (count,) of the volume by s, m2."""
-        return self.outline.size_by_s() * self.outline.part.domain.thickness
-
-
-def free_form(part: SolidPart, coarser: float) -> FreePlate | FreeSurface:
-    """Return what moves of a part: the outline of a plate, or a surface."""
-    if part.flat is not None:
-        return FreePlate(part.domain, free_outline(part.flat))
-    return free_surface(part, part.mesh(coarser))
 
 
 def free_surface(part: SolidPart, mesh: Tetrahedra) -> FreeSurface:

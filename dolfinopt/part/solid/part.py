@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dolfinopt.density.measured import GREY
 from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
@@ -25,6 +24,7 @@ from dolfinopt.part.solid.surface import (
     WHOLE,
     Surface,
     at_volume,
+    cavities,
     check_surface,
     crossings,
     distance_to_faces,
@@ -193,23 +193,28 @@ class SolidPart:
         """Whether every edge has two triangles, which run along it in opposite directions."""
         return not len(open_edges(self.surface))
 
+    @cached_property
+    def cavities(self) -> np.ndarray:
+        """Middles (k, 3) of its closed cavities, m."""
+        return cavities(self.surface) if self.flat is None else np.empty((0, 3))
+
     @property
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
         one, found = self.domain, []
-        if one.grayness > GREY:
-            found.append(
-                f"arm {one.name!r}: grayness {one.grayness:.2g}: {100.0 * one.gray_share:.0f} % of "
-                "the material is in cells that are neither solid nor void; the part is another "
-                'design than the optimised one; optimise with design.projection = "robust" until '
-                "it is crisp"
-            )
+        found += one.gray_words
         if self.pieces:
             pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
             share = 100.0 * self.pieces_volume / one.volume
             found.append(
                 f"arm {one.name!r}: {pieces} without a joint to both interfaces "
                 f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
+            )
+        if len(self.cavities):
+            places = "; ".join("({:.1f}, {:.1f}, {:.1f})".format(*at) for at in 1e3 * self.cavities)
+            found.append(
+                f"arm {one.name!r}: closed cavities at {places} mm, which no tool and no powder "
+                "leaves; [[arms.regions]] keeps a way out void"
             )
         return found + self._narrow()
 
@@ -252,6 +257,7 @@ class SolidPart:
             "widths_to": self.widths.to,
             "filter_radius": self.domain.filter_radius,
             "pieces_left_out": self.pieces,
+            "cavities": self.cavities.tolist(),
             "grayness": self.domain.grayness,
             "warnings": self.warnings,
         }
@@ -276,7 +282,7 @@ class SolidPart:
             yield ".step", solid_text(shape, t, name, -0.5 * t)
             yield ".dxf", dxf_text(shape)
 
-    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] = ()) -> Tetrahedra:
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> Tetrahedra:
         """Return tetrahedra, all about as large, see `part.Part`."""
         size = coarser * mesh_size(self)
         try:
@@ -306,7 +312,7 @@ def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart
         if not curves.is_default:
             raise InputError(
                 f"arm {domain.name!r}: its design varies over the thickness, so that its part has "
-                "no curves: leave out --tool-radius, --tolerance and --curves, or optimise with "
+                "no curves: leave out --tool-radius, --tolerance and --round, or optimise with "
                 "arms.extruded = true"
             )
         return _freeform_part(domain)
@@ -318,7 +324,7 @@ def plate_part(domain: SolidDomain, flat: PlanePart) -> SolidPart:
     outline, t = flat.outline, flat.domain.thickness
     surface = _prism(flat.shape, t, 0.5 * flat.tolerance)
     lost = t * outline.islands_area
-    far = flat.shape.distance
+    far = flat.distance
     return SolidPart(domain, surface, outline.level, far, outline.islands, lost, flat)
 
 

@@ -454,6 +454,22 @@ def open_edges(surface: Surface) -> np.ndarray:
     return edges[~np.isin(back, there) | (times[which] > 1)]
 
 
+def cavities(surface: Surface) -> np.ndarray:
+    """Return the middles (k, 3) of closed cavities, m: sheets that turn inwards."""
+    import scipy.sparse as sp
+    from scipy.sparse.csgraph import connected_components
+
+    count, triangles = len(surface.points), surface.triangles
+    ends = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2])])
+    links = sp.coo_matrix((np.ones(len(ends)), ends.T), (count, count))
+    sheets, sheet = connected_components(links, directed=False)
+    a, b, c = surface.corners.swapaxes(0, 1)
+    of = sheet[triangles[:, 0]]
+    volume = np.bincount(of, np.einsum("na,na->n", a, np.cross(b, c)), sheets)
+    middle = np.stack([np.bincount(of, one, sheets) for one in surface.corners.mean(axis=1).T])
+    return np.asarray((middle / np.bincount(of, minlength=sheets).clip(1)).T[volume < 0.0])
+
+
 def check_surface(name: str, surface: Surface) -> None:
     """Raise InputError, with arm and place, unless a surface is closed and crosses itself nowhere.
 

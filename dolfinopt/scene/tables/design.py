@@ -489,23 +489,24 @@ class Part(Table):
         default=None,
         ge=0,
         le=1e4,
-        description="least radius of concave corners; default: a fifth of a cell [m]",
+        description="least radius of concave corners; default: 0.003 [m]",
     )
     tolerance: Length | None = Field(
         default=None,
-        description="largest distance of the curves from the outline; default: 0.1 mm or a tenth "
-        "of a cell, the smaller [m]",
+        description="how far sides may lie from the outline of the densities; default: half a cell "
+        "[m]",
     )
     minimum_member: Length | None = Field(
         default=None,
-        description="smallest width of members of a part; default: design.minimum_member [m]",
+        description="smallest width of members of a part; default: design.minimum_member, or 0.001 "
+        "[m]",
     )
     curves: Literal["splines", "arcs"] = Field(
-        default="splines", description="free curves: splines, or lines and arcs alone [-]"
+        default="splines", description="without effect: parts have lines, arcs and circles [-]"
     )
     simplify: bool = Field(
         default=False,
-        description="straight lines and fillets in place of splines, sides of struts parallel [-]",
+        description="without effect: sides are straight, with fillets between them [-]",
     )
     optimize: bool = Field(
         default=False,
@@ -524,12 +525,3 @@ class Part(Table):
         le=MAX_STARTS,
         description="trusses that the curves start from besides the result of the densities [-]",
     )
-
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse to optimise lines and arcs."""
-        if self.optimize and self.curves == "arcs":
-            raise Refusal(
-                'expected "splines" with part.optimize = true, which moves their control points',
-                (*at, "curves"),
-                (*at, "optimize"),
-            )

@@ -1,0 +1,681 @@
+"""Sides along the polygon of an outline: its free runs become straight lines, fillets and circles.
+
+The polygon is cut where it comes to another curve of the arm. A free run is divided by Douglas and
+Peucker's rule, and each portion becomes its line of least squares. Sides that are too short for the
+fillets at their ends go, and so do corners that hardly turn. Of a symmetric arm the upper half is
+drawn and mirrored. At last the nearest outline is found that keeps the limits and the area.
+Source: Douglas & Peucker (1973), doi:10.3138/FM57-6770-U75U-7727.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import count as counting
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.part.domain import Edge
+from dolfinopt.part.plane.curves import MIRROR, Arc, Curve, Line, Piece
+from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, TURN, Limits
+from dolfinopt.part.plane.outline import Outline
+from dolfinopt.part.plane.sides import (
+    BrokenError,
+    Circle,
+    Corner,
+    Loop,
+    Side,
+    Sides,
+    angle_of,
+    left,
+    meet,
+    turn_between,
+    unit,
+)
+
+if TYPE_CHECKING:
+    from shapely import Geometry
+
+MIDDLE = 0.7  # share of a portion that its line is fitted to
+LEAST = 0.3  # length of a side that is worth drawing, cells
+SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
+UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
+SMALLEST = 3.0  # area of a hole that a search begins with, squared cells
+ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
+SAME_AREA, ROUGHLY = 1e-3, 0.02  # relative; of few sides
+WORTH = 0.8  # of a distance from the outline, below which more sides come into question
+THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
+REACH = 3.0  # cells from the ends of two sides within which they meet
+CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
+STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
+SMALL = 0.05  # least radius of a fillet, cells: of a tool without radius
+LEAVING = 1.2 * TURN  # between a line and a circle that stays solid, at least
+ROOM = 0.45  # share of a side that a fillet at one of its ends may take
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A side, and about where it begins and ends (2,), m."""
+
+    side: Side
+    start: np.ndarray
+    end: np.ndarray
+
+    @property
+    def names(self) -> set[int]:
+        """Its key and that of its mirror image."""
+        return {self.side.key, self.side.twin} - {-1}
+
+    def mirrored(self) -> Drawn:
+        """Return the mirror image about y = 0, run through with the material to the left."""
+        return Drawn(self.side.mirrored(), self.end * MIRROR, self.start * MIRROR)
+
+    def named(self, key: int = -1, twin: int = -1) -> Drawn:
+        """Return it with other names where they are given."""
+        key = self.side.key if key < 0 else key
+        twin = self.side.twin if twin < 0 else twin
+        return replace(self, side=replace(self.side, key=key, twin=twin))
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Points (n, 2), m, of the outline along one curve of the arm, or free."""
+
+    points: np.ndarray
+    edge: int  # number of the curve among `Domain.edges`; -1: free; their number: the axis
+
+
+def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides:
+    """Return the sides along an outline.
+
+    Args:
+        outline: whose polygon they follow.
+        limits: of the part.
+        tolerance: how far they may lie from the polygon, m.
+        area: to be enclosed, m2; missed where limits ask for more.
+
+    Raises:
+        InputError: there are no sides without crossings that keep the limits.
+    """
+    thin = replace(limits, member=min(limits.member, THIN * limits.cell))
+    for kept in (limits, thin):  # what is thinner than asked for is told
+        best: tuple[float, float, Sides] | None = None
+        for share in ATTEMPTS:
+            made = _made(outline, kept, share * tolerance, area, np.pi * limits.tool**2)
+            if made is None:
+                continue
+            off = abs(made.shape.area / area - 1.0)
+            one = off if off > SAME_AREA else 0.0, distance(made, outline), made
+            # More sides must be worth their number.
+            if best is None or (one[0], one[1]) < (best[0], WORTH * best[1]):
+                best = one
+            if best[0] == 0.0 and best[1] <= tolerance:
+                break
+        if best is not None:
+            return best[2]
+    raise InputError(
+        f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
+        "the outline; choose another --tolerance or a smaller --tool-radius"
+    )
+
+
+def rough_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
+    """Return few sides along an outline, which a search will move; None: there are none."""
+    least = SMALLEST * max(limits.cell, limits.tool) ** 2
+    made = (_made(outline, limits, share * tolerance, area, least) for share in ATTEMPTS)
+    return next((one for one in made if one and abs(one.shape.area / area - 1.0) < ROUGHLY), None)
+
+
+def _made(
+    outline: Outline, limits: Limits, tolerance: float, area: float, hole: float
+) -> Sides | None:
+    """Return sides along an outline that keep the limits; None: there are none."""
+    try:
+        drawn = _drawn(outline, limits, tolerance, hole)
+    except BrokenError:
+        return None
+    found = limits.nearest(drawn, area=area) or limits.nearest(drawn)
+    return None if found is None else found[0]
+
+
+def distance(sides: Sides, outline: Outline) -> float:
+    """Return the largest distance of the sides from the outline's polygon, m."""
+    import shapely
+
+    lines = [
+        shapely.LineString(one.piece.curve.at(np.linspace(0.0, 1.0, 17)))
+        for one in sides.placed
+        if one.piece.free
+    ]
+    if not lines:
+        return 0.0
+    boundary: Any = outline.polygon.boundary
+    shapely.prepare(boundary)
+    points = shapely.points(shapely.get_coordinates(lines))
+    return float(shapely.distance(points, boundary).max())
+
+
+# -- runs of the polygon --------------------------------------------------------------------------
+
+
+def _rings(outline: Outline) -> Iterator[np.ndarray]:
+    """Yield the corners (n, 2) of all rings, material to the left; of upper halves by symmetry."""
+    import shapely
+
+    polygon: Any = outline.polygon
+    if outline.domain.symmetric:
+        x0, _, x1, y1 = polygon.bounds
+        polygon = polygon.intersection(shapely.box(x0 - 1.0, 0.0, x1 + 1.0, y1 + 1.0))
+    for part in shapely.get_parts(polygon):
+        oriented = shapely.geometry.polygon.orient(part)
+        for ring in (oriented.exterior, *oriented.interiors):
+            points = np.asarray(ring.coords)[:-1]
+            step = np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+            points = points[step > 1e-3 * outline.chord]
+            if len(points) > 2:
+                yield points
+
+
+def _runs(points: np.ndarray, lines: Sequence[Any], chord: float, tolerance: float) -> list[Run]:
+    """Cut a closed polygon where it comes to another curve."""
+    on = _owners(points, lines, 3.0 * chord)
+    on = _without_dents(points, on, lines, tolerance)
+    on = _without_specks(points, on, tolerance)
+    return [
+        Run(points[np.append(block, block[-1] + 1) % len(points)], int(on[block[0]]))
+        for block in _blocks(on)
+    ]
+
+
+def _owners(points: np.ndarray, lines: Sequence[Any], near: float) -> np.ndarray:
+    """Return for every side of a closed polygon the number of the curve it lies on, or -1."""
+    import shapely
+
+    at, middle = (shapely.points(p) for p in (points, 0.5 * (points + np.roll(points, -1, axis=0))))
+    on, best = np.full(len(points), -1), np.full(len(points), near)
+    for k, line in enumerate(lines):
+        corner = shapely.dwithin(at, line, near)
+        both = np.flatnonzero(corner & np.roll(corner, -1))
+        away = shapely.distance(middle[both], line)
+        better = both[away < best[both] - 1e-3 * near]
+        best[both] = np.minimum(best[both], away)
+        on[better] = k
+    return on
+
+
+def _blocks(on: np.ndarray) -> list[np.ndarray]:
+    """Return the sides of a closed polygon in blocks of one owner, cyclic."""
+    starts = np.flatnonzero(on != np.roll(on, 1))
+    if len(starts) == 0:
+        return [np.arange(len(on))]
+    ends = np.append(starts[1:], starts[0] + len(on))
+    return [np.arange(a, b) % len(on) for a, b in zip(starts, ends, strict=True)]
+
+
+def _without_dents(
+    points: np.ndarray, on: np.ndarray, lines: Sequence[Any], depth: float
+) -> np.ndarray:
+    """Give free blocks that hardly leave a curve between two blocks of it to that curve."""
+    import shapely
+
+    blocks = _blocks(on)
+    for k, block in enumerate(blocks):
+        before, after = on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]
+        if len(blocks) > 1 and on[block[0]] == -1 and before == after != -1:
+            if shapely.distance(shapely.points(points[block]), lines[before]).max() < depth:
+                on[block] = before
+    return on
+
+
+def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarray:
+    """Make blocks on curves that are shorter than `size` free where both neighbours are."""
+    step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    blocks = _blocks(on)
+    for k, block in enumerate(blocks):
+        before, after = on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]
+        if len(blocks) > 1 and before == after == -1 and step[block].sum() < size:
+            on[block] = -1
+    return on
+
+
+# -- loops of sides -------------------------------------------------------------------------------
+
+
+def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> Sides:
+    """Return sides along an outline before their limits are looked at; no smaller holes, m2."""
+    import shapely
+
+    domain, names = outline.domain, counting()
+    edges, curves = domain.edges, [edge.curve for edge in domain.edges]
+    if domain.symmetric:
+        wide = np.array([4.0 * domain.extent, 0.0])
+        curves = [*curves, Line(-wide, wide)]
+    lines = [
+        shapely.LineString(np.vstack([c.at(c.parameters(outline.chord)), c.end])) for c in curves
+    ]
+    outer, boundary = domain.outer_edges, outline.polygon.boundary
+
+    def as_wide(_: int, place: np.ndarray, half: float) -> float:
+        """Return the radius of a fillet that touches the outline."""
+        gap = float(shapely.distance(shapely.Point(place), boundary))
+        return gap / (1.0 / np.cos(half) - 1.0)
+
+    loops: list[Loop] = []
+    circles: list[Circle] = []
+    fixed: list[tuple[Piece, ...]] = []
+    for ring in _rings(outline):
+        runs = _runs(ring, lines, outline.chord, tolerance)
+        for chain, halved in _chains(runs, len(edges) if domain.symmetric else -2):
+            if _hole_area(chain, halved) < hole:
+                continue
+            twins = domain.symmetric and not halved
+            if (circle := _free_circle(chain, halved, tolerance)) is not None:
+                circles += _named_circles(circle, twins, halved, names)
+                continue
+            closed = len(chain) == 1 and not halved
+            drawn = [one for run in chain for one in _sides_along(run, edges, tolerance, closed)]
+            drawn = _distinct([one.named(key=next(names)) for one in drawn], halved)
+            drawn = _whole(drawn, names) if halved else drawn
+            drawn = cleaned(_leaving(drawn, outer), limits)
+            drawn = _leaving(cornered(drawn, limits, boundary, tolerance), outer)
+            if not drawn:
+                continue
+            if _is_circle(drawn):
+                curve = drawn[0].side.curve
+                assert curve is not None
+                piece = Piece(curve, drawn[0].side.label)
+                fixed += [(one,) for one in ([piece, _mirrored(piece)] if twins else [piece])]
+                continue
+            pair = [drawn]
+            if twins:
+                pair[0] = [one.named(twin=next(names)) for one in drawn]
+                pair.append([one.mirrored() for one in reversed(pair[0])])
+            loops += [looped(some, limits, outer, as_wide) for some in pair]
+    loops.sort(key=lambda loop: -loop.area)
+    return Sides(tuple(loops), tuple(circles), tuple(fixed)).centred()
+
+
+def _chains(runs: list[Run], axis: int) -> Iterator[tuple[list[Run], bool]]:
+    """Yield the runs of a ring between those on the axis of symmetry, and whether it has any."""
+    cuts = [k for k, run in enumerate(runs) if run.edge == axis]
+    if not cuts:
+        yield runs, False
+        return
+    for a, b in pairwise([*cuts, cuts[0] + len(runs)]):
+        if chain := [runs[k % len(runs)] for k in range(a + 1, b)]:
+            yield chain, True
+
+
+def _hole_area(chain: Sequence[Run], halved: bool) -> float:
+    """Return the area of the hole that a free chain bounds, m2; infinite where it is not free."""
+    if any(run.edge >= 0 for run in chain):
+        return float("inf")
+    x, y = np.vstack([run.points for run in chain]).T
+    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) * (1.0 + halved)
+
+
+def _is_circle(drawn: Sequence[Drawn]) -> bool:
+    """Return whether one closed curve of the arm makes a ring."""
+    curve = drawn[0].side.curve
+    return (
+        len(drawn) == 1
+        and curve is not None
+        and bool(np.linalg.norm(curve.end - curve.start) < 1e-9)
+    )
+
+
+def _mirrored(piece: Piece) -> Piece:
+    return replace(piece, curve=piece.curve.mirrored().reversed())
+
+
+def _runs_along(curve: Curve, points: np.ndarray) -> bool:
+    """Return whether points follow a curve in its own sense."""
+    side, steps = Side(points[0], curve=curve), np.diff(points, axis=0)
+    middles = 0.5 * (points[1:] + points[:-1])
+    return sum(float(side.foot(p)[1] @ d) for p, d in zip(middles, steps, strict=True)) > 0.0
+
+
+def _free_circle(chain: Sequence[Run], halved: bool, tolerance: float) -> Circle | None:
+    """Return the round hole that a free chain follows within a tolerance, m; None: it does not."""
+    if any(run.edge >= 0 for run in chain):
+        return None
+    points = np.vstack([run.points for run in chain])
+    if halved:
+        points = np.vstack([points, (points * MIRROR)[::-1]])
+    points = np.vstack([points, 0.5 * (points[1:] + points[:-1])])  # the polygon's sides, too
+    middle = points.mean(axis=0)
+    p = points - middle
+    system = np.column_stack([2.0 * p, np.ones(len(p))])
+    x, y, rest = np.linalg.lstsq(system, (p**2).sum(axis=1), rcond=None)[0]
+    radius = float(np.sqrt(rest + x * x + y * y))
+    centre = middle + np.array([x, 0.0 if halved else y])
+    off = np.abs(np.linalg.norm(points - centre, axis=1) - radius).max()
+    if off > min(tolerance, 0.1 * radius):
+        return None
+    return Circle(centre, radius)
+
+
+def _named_circles(circle: Circle, twins: bool, halved: bool, names: Iterator[int]) -> list[Circle]:
+    key = next(names)
+    if halved:
+        return [replace(circle, key=key, twin=key)]
+    if not twins:
+        return [replace(circle, key=key)]
+    twin = next(names)
+    image = Circle(circle.centre * MIRROR, circle.radius, twin, key)
+    return [replace(circle, key=key, twin=twin), image]
+
+
+def _sides_along(run: Run, edges: Sequence[Edge], tolerance: float, closed: bool) -> list[Drawn]:
+    """Return the sides along a run."""
+    if run.edge < 0:
+        return _straight(run.points, tolerance, closed)
+    edge, ends = edges[run.edge], run.points[[0, -1]]
+    curve = edge.curve if _runs_along(edge.curve, run.points) else edge.curve.reversed()
+    angle = angle_of(curve.end - curve.start) if isinstance(curve, Line) else 0.0
+    side = Side(ends.mean(axis=0), angle, curve, edge.label, run.edge)
+    return [Drawn(side, *ends)]
+
+
+def _straight(points: np.ndarray, tolerance: float, closed: bool) -> list[Drawn]:
+    """Return the lines of least squares along a polyline."""
+    import shapely
+
+    if closed:  # begin at a corner
+        far = int(np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1)))
+        points = np.vstack([points[far:-1], points[: far + 1]])
+    line = shapely.LineString(points)
+    corners = shapely.get_coordinates(line.simplify(tolerance))
+    passed = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    last = len(points) - 1
+    at = [passed[np.argmin(np.linalg.norm(points[:last] - c, axis=1))] for c in corners[:-1]]
+    found = []
+    for (a, b), ends in zip(pairwise([*at, passed[-1]]), pairwise(corners), strict=True):
+        cut = 0.5 * (1.0 - MIDDLE) * (b - a)
+        p = shapely.get_coordinates(line.interpolate(np.linspace(a + cut, b - cut, 40)))
+        middle = p.mean(axis=0)
+        d = np.linalg.svd(p - middle)[2][0]
+        d = d if d @ (p[-1] - p[0]) > 0.0 else -d
+        found.append(Drawn(Side(middle, angle_of(d)), *ends))
+    return found
+
+
+def _distinct(drawn: Sequence[Drawn], halved: bool = False) -> list[Drawn]:
+    """Return sides without those of the arm's own that go on as the one before."""
+    found: list[Drawn] = []
+    names: dict[int, int] = {}
+    for one in drawn:
+        if found and _goes_on(found[-1].side, one.side):
+            names[one.side.key] = found[-1].side.key
+            found[-1] = replace(found[-1], end=one.end)
+        else:
+            found.append(one)
+    if len(found) > 1 and not halved and _goes_on(found[-1].side, found[0].side):
+        names[found[-1].side.key] = found[0].side.key
+        found[0] = replace(found[0], start=found[-1].start)
+        del found[-1]
+    return [one.named(twin=names.get(one.side.twin, one.side.twin)) for one in found]
+
+
+def _goes_on(a: Side, b: Side) -> bool:
+    """Return whether a curve of the arm's own goes on as another one."""
+    if a.curve is None or b.curve is None or a.label != b.label:
+        return False
+    if isinstance(a.curve, Arc) and isinstance(b.curve, Arc):
+        apart = np.linalg.norm(a.curve.centre - b.curve.centre)
+        return bool(apart + abs(a.curve.radius - b.curve.radius) < 1e-7)
+    if isinstance(a.curve, Line) and isinstance(b.curve, Line):
+        off = (b.point - a.point) @ left(unit(a.angle))
+        return abs(turn_between(unit(a.angle), unit(b.angle))) < 1e-6 and abs(off) < 1e-7
+    return a.edge == b.edge
+
+
+def _whole(half: Sequence[Drawn], names: Iterator[int]) -> list[Drawn]:
+    """Return the sides of a whole loop from those of its upper half."""
+    # The first and the last may cross the axis: circles about it, and lines, which become upright.
+    made = [_crossing(one) if k in (0, len(half) - 1) else one for k, one in enumerate(half)]
+    made = [one if one.side.twin >= 0 else one.named(twin=next(names)) for one in made]
+    whole = made + [one.mirrored() for one in reversed(made) if one.side.key != one.side.twin]
+    # A side across the axis begins, or ends, at the mirror image of its other end.
+    if len(half) > 1 and made[0].side.key == made[0].side.twin:
+        whole[0] = replace(made[0], start=made[0].end * MIRROR)
+    if made[-1].side.key == made[-1].side.twin:
+        whole[len(made) - 1] = replace(made[-1], end=made[-1].start * MIRROR)
+    return whole
+
+
+def _crossing(one: Drawn) -> Drawn:
+    """Return a side that ends on the axis of symmetry as its own mirror image, if it may be one."""
+    side = one.side
+    if isinstance(side.curve, Arc):
+        is_own = abs(side.curve.centre[1]) < 1e-9
+    else:
+        slack = np.sin(UPRIGHT if side.free else 1e-4)
+        is_own = (side.free or isinstance(side.curve, Line)) and abs(np.cos(side.angle)) < slack
+    if not is_own:
+        return one
+    angle = 0.5 * np.pi * float(np.sign(np.sin(side.angle)))
+    return replace(
+        one, side=replace(side, point=side.point * [1.0, 0.0], angle=angle, twin=side.key)
+    )
+
+
+def _leaving(drawn: Sequence[Drawn], outer: int) -> list[Drawn]:
+    """Return sides whose lines leave circles that stay solid in a corner that can be rounded.
+
+    A tangent has no corner there, and one that turns the other way would cut into the circle: it
+    is moved inwards until it leaves the circle at a little more than the least turn.
+    """
+    made, count = list(drawn), len(drawn)
+    for k, one in enumerate(drawn):
+        along = unit(one.side.angle)
+        out, touched = -left(along), []
+        for j, sense in (((k - 1) % count, 1.0), ((k + 1) % count, -1.0)):
+            arc = drawn[j].side.curve
+            if one.side.free and drawn[j].side.edge >= outer and isinstance(arc, Arc):
+                height = float((one.side.point - arc.centre) @ out)
+                above = height - arc.radius * np.cos(LEAVING)
+                if arc.sweep > 0.0 and 0.0 < above < arc.radius:
+                    touched.append((j, sense, arc, height, above))
+        if not touched:
+            continue
+        drop = max(above for *_, above in touched)
+        made[k] = replace(made[k], side=one.side.moved(-drop, 0.0))
+        for j, sense, arc, height, _ in touched:
+            reach = float(np.sqrt(arc.radius**2 - (height - drop) ** 2))
+            place = arc.centre + (height - drop) * out + sense * reach * along
+            ends = ("start", "end") if sense > 0.0 else ("end", "start")
+            made[k] = replace(made[k], **{ends[0]: place})
+            made[j] = replace(made[j], **{ends[1]: place})
+    return made
+
+
+# -- corners --------------------------------------------------------------------------------------
+
+
+def _vertices(drawn: Sequence[Drawn], reach: float) -> tuple[np.ndarray, list[float]]:
+    """Return where each side meets the one before (n, 2), and by how much the outline turns there.
+
+    The turn is NaN where they do not meet within a length, m, of their ends.
+    """
+    places, turns = [], []
+    for k, one in enumerate(drawn):
+        before = drawn[k - 1]
+        near, turn = 0.5 * (before.end + one.start), float("nan")
+        apart = float(np.linalg.norm(before.end - one.start))
+        try:
+            place = meet(before.side, one.side, 0.0, near)
+            if np.linalg.norm(place - near) < reach + apart:
+                near = place
+                turn = turn_between(before.side.foot(place)[1], one.side.foot(place)[1])
+        except BrokenError:
+            pass
+        places.append(near)
+        turns.append(turn)
+    return np.array(places), turns
+
+
+def cleaned(drawn: Sequence[Drawn], limits: Limits) -> list[Drawn]:
+    """Return sides without those too short for their fillets, or that go on as the one before.
+
+    Empty where nothing is left of a loop.
+    """
+    drawn = _distinct(drawn)
+    while len(drawn) > 2 or not any(one.side.free for one in drawn):
+        k, merges = _worst(drawn, limits)
+        if k is None:
+            return drawn
+        drawn = _merged(drawn, k) if merges else drawn
+        gone = drawn[k].names
+        drawn = _distinct([one for one in drawn if not one.names & gone])
+    return []
+
+
+def cornered(
+    drawn: list[Drawn], limits: Limits, boundary: Geometry, tolerance: float
+) -> list[Drawn]:
+    """Return sides without those in whose place a corner of their neighbours, rounded, will do.
+
+    Args:
+        drawn: the sides of a loop.
+        limits: of the part.
+        boundary: of the outline's polygon (shapely).
+        tolerance: distance from it up to which a corner will do, m.
+    """
+    done: set[int] = set()
+    while True:
+        order = sorted(drawn, key=lambda one: float(np.linalg.norm(one.end - one.start)))
+        found = next(
+            (
+                one
+                for one in order
+                if one.side.free
+                and one.side.key not in done
+                and len(drawn) > 2 + len(one.names)
+                and _corner_will_do(drawn, drawn.index(one), limits, boundary, tolerance)
+            ),
+            None,
+        )
+        if found is None:
+            return drawn
+        done |= found.names
+        left = cleaned([one for one in drawn if not one.names & found.names], limits)
+        drawn = left or drawn
+
+
+def _corner_will_do(
+    drawn: Sequence[Drawn], k: int, limits: Limits, boundary: Geometry, tolerance: float
+) -> bool:
+    """Return whether the sides beside side k meet near the outline, with a fillet that fits."""
+    import shapely
+
+    before, one, after = drawn[k - 1], drawn[k], drawn[(k + 1) % len(drawn)]
+    if one.side.key == one.side.twin and not {before.side.key, after.side.key} - one.names:
+        return False
+    try:
+        place = meet(before.side, after.side, 0.0, 0.5 * (one.start + one.end))
+    except BrokenError:
+        return False
+    a, b = before.side.foot(place)[1], after.side.foot(place)[1]
+    turn = turn_between(a, b)
+    ends = np.linalg.norm(one.start - place), np.linalg.norm(one.end - place)
+    if abs(turn) > CORNER or max(ends) > REACH * limits.cell:
+        return False
+    gap = float(shapely.distance(shapely.Point(place), boundary))
+    if turn > 0.0:
+        return gap <= tolerance
+    half = min(-turn / 2.0, STEEP)
+    radius = max(gap / (1.0 / np.cos(half) - 1.0), limits.tool) if half > 0.0 else np.inf
+    lengths = (np.linalg.norm(place - before.start), np.linalg.norm(after.end - place))
+    if radius * np.tan(half) > ROOM * min(lengths):
+        return False
+    out = -left(a) - left(b)
+    centre = place + radius / np.cos(half) * out / np.linalg.norm(out)
+    begin = angle_of(left(a))
+    arc = Arc(centre, radius, begin, turn).at(np.linspace(0.0, 1.0, 7))
+    return bool(shapely.distance(shapely.points(arc), boundary).max() <= tolerance)
+
+
+def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
+    """Return the number of the side to leave out, and whether the one before takes its place."""
+    places, turns = _vertices(drawn, REACH * limits.cell)
+    need = [limits.tool * np.tan(min(-turn / 2.0, STEEP)) if turn < 0.0 else 0.0 for turn in turns]
+    worst, least, merges = None, np.inf, False
+    for k, one in enumerate(drawn):
+        j = (k + 1) % len(drawn)
+        before, after = drawn[k - 1].side, drawn[j].side
+        if one.side.label or not (one.side.free or before.free or after.free):
+            continue
+        step = places[j] - places[k]
+        room = float(step @ unit(one.side.angle) if one.side.free else np.linalg.norm(step))
+        room -= need[k] + need[j] + LEAST * limits.cell
+        meets = not np.isnan([turns[k], turns[j]]).any()
+        is_end = any(turns[i] > SPIKE for i in (k, j))  # of a strut that ends nowhere
+        both = before.free and one.side.free and one.side.twin != before.key
+        straight = both and abs(turns[k]) < 2.0 * TURN
+        if room >= 0.0 and meets and not is_end and not straight:
+            continue
+        # The shortest one: where two sides do not meet well, a long one looks turned round.
+        size = 0.0 if straight else float(np.linalg.norm(one.end - one.start))
+        if size < least:
+            worst, least, merges = k, size, straight
+    return worst, merges
+
+
+def _merged(drawn: list[Drawn], k: int) -> list[Drawn]:
+    """Return sides of which the one before side k runs along both; its mirror image likewise."""
+    before, one = drawn[k - 1], drawn[k]
+    along = one.end - before.start
+    side = replace(before.side, point=0.5 * (before.start + one.end), angle=angle_of(along))
+    made = Drawn(side, before.start, one.end)
+    if side.twin == side.key:
+        return drawn
+    image = made.mirrored()
+    return [made if s is before else image if s.side.key == side.twin else s for s in drawn]
+
+
+def is_rounded(a: Side, b: Side, turn: float, outer: int) -> bool:
+    """Return whether the tool rounds the corner between two sides; not those of the arm's own.
+
+    Args:
+        a, b: one after the other.
+        turn: of the outline, rad.
+        outer: number of the arm's own curves, the first of `Domain.edges`.
+    """
+    return turn < 0.0 and not (0 <= a.edge < outer and 0 <= b.edge < outer)
+
+
+def looped(
+    drawn: Sequence[Drawn],
+    limits: Limits,
+    outer: int,
+    radius_at: Callable[[int, np.ndarray, float], float],
+) -> Loop:
+    """Return a loop of sides with fillets at its concave corners.
+
+    Args:
+        drawn: the sides.
+        limits: of the part; radii are within them, and leave room on the sides.
+        outer: number of the arm's own curves.
+        radius_at: returns the wanted radius, m, of the corner before a side of this number, at this
+            place (2,), half of whose turn is this angle.
+    """
+    places, turns = _vertices(drawn, REACH * limits.cell)
+    corners = []
+    for k, (place, turn) in enumerate(zip(places, turns, strict=True)):
+        a, b = drawn[k - 1].side, drawn[k].side
+        if not is_rounded(a, b, turn, outer):
+            corners.append(Corner(place))
+            continue
+        half = min(-turn / 2.0, STEEP)
+        ends = (places[k - 1], places[(k + 1) % len(places)])
+        room = ROOM * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
+        radius = min(radius_at(k, place, half), room, 0.9 * LARGEST * limits.cell)
+        radius = max(radius, limits.tool, SMALL * limits.cell)
+        out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
+        near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)
+        corners.append(Corner(near, radius))
+    return Loop(tuple(one.side for one in drawn), tuple(corners))

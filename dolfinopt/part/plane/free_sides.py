@@ -1,0 +1,269 @@
+"""The sides of a part as variables of its optimisation, with their limits and its mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from dolfinopt.errors import InputError
+from dolfinopt.mesh.solid_cells import Tetrahedra
+from dolfinopt.part.domain import SolidDomain
+from dolfinopt.part.mesh import BodyMesh, PlateMesh, extruded
+from dolfinopt.part.plane.curves import Line
+from dolfinopt.part.plane.limits import Limits
+from dolfinopt.part.plane.part import PlanePart
+from dolfinopt.part.plane.sides import (
+    ArcMoves,
+    Circle,
+    Corner,
+    LineMoves,
+    Loop,
+    Side,
+    Sides,
+    angle_of,
+    left,
+    unit,
+)
+from dolfinopt.part.plane.simpler import simplifications, without_struts
+from dolfinopt.part.solid.part import SolidPart, plate_part
+
+MOST = 40  # sides and holes that go at once, at most
+FAR_STEPS = 40  # of Newton's to an outline without a strut
+WORN = 0.12  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
+Mesh = BodyMesh | Tetrahedra  # of a plate in space a `PlateMesh`
+Fewer = Callable[[Sides, Limits, int], Iterator[Sides]]
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSides:
+    """The sides of one plane part, or of a plate in space.
+
+    Attributes:
+        part: that it was made of.
+        sides: its outline.
+        limits: that they keep.
+        solid: the arm in space of a plate; None in the plane.
+        repeated: (n, count) of q by the variables of the arm whose design this one repeats; None:
+            it has its own.
+    """
+
+    part: PlanePart
+    sides: Sides
+    limits: Limits
+    solid: SolidDomain | None = None
+    repeated: np.ndarray | None = None
+
+    @property
+    def cell(self) -> float:
+        """Size of the design's cells, m."""
+        return self.limits.cell
+
+    @property
+    def count(self) -> int:
+        """Number of variables."""
+        return self.sides.count
+
+    @cached_property
+    def plane(self) -> PlanePart:
+        """The part in the plane with these sides."""
+        return replace(self.part, sides=self.sides)
+
+    @property
+    def current(self) -> PlanePart | SolidPart:
+        """The part with these sides."""
+        return self.plane if self.solid is None else plate_part(self.solid, self.plane)
+
+    made = current
+
+    @property
+    def size(self) -> float:
+        """Area, m2; of a plate in space volume, m3."""
+        return self.sides.shape.area * self._thickness
+
+    @property
+    def _thickness(self) -> float:
+        return 1.0 if self.solid is None else self.part.domain.thickness
+
+    @property
+    def _ties(self) -> np.ndarray:
+        return self.sides.ties if self.repeated is None else self.repeated
+
+    def rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return what must not be positive (m,), m, and its derivatives (m, count)."""
+        return self.limits.rows(self.sides)
+
+    def ends_by_x(self) -> np.ndarray:
+        """Return the derivatives (m, count) by x of the places of all corners and fillets."""
+        found = [
+            one.moves.centre if isinstance(one.moves, ArcMoves) else one.moves.start
+            for one in self.sides.placed
+            if isinstance(one.moves, (ArcMoves, LineMoves))
+        ]
+        return np.vstack([np.zeros((1, self.sides.numbers[0])), *found]) @ self.sides.ties
+
+    def simplified(self, fewer: Fewer = simplifications) -> tuple[FreeSides, int]:
+        """Return it without what its limits hold at its least, and how many such things went.
+
+        Args:
+            fewer: yields outlines without one of such things.
+        """
+        made = self
+        for number in range(MOST):
+            for sides in fewer(made.sides, self.limits, self.part.domain.outer_edges):
+                found = replace(made, sides=sides).nearest()
+                if found is not None and found[0].count < made.count:
+                    made = found[0]
+                    break
+            else:
+                return made, number
+        return made, MOST
+
+    def without_struts(self) -> Iterator[FreeSides]:
+        """Yield it without one of its struts, the thinnest first."""
+        for sides in without_struts(self.sides, self.limits, self.part.domain.outer_edges):
+            if (found := replace(self, sides=sides).nearest(FAR_STEPS)) is not None:
+                yield found[0]
+
+    def moved(self, x: np.ndarray) -> FreeSides:
+        """Return it after a step x.
+
+        Raises:
+            BrokenError: its sides do not close.
+        """
+        return replace(self, sides=self.sides.moved(self.sides.ties @ x))
+
+    def nearest(self, steps: int = 12) -> tuple[FreeSides, np.ndarray] | None:
+        """Return the nearest one that keeps the limits, and the step to it; None: there is none."""
+        found = self.limits.nearest(self.sides, steps)
+        return None if found is None else (replace(self, sides=found[0]), found[1])
+
+    def meshed(self, turns: np.ndarray | None = None) -> tuple[FreeSides, Mesh]:
+        """Return it with a new mesh; variables stay.
+
+        Args:
+            turns: (n,) of its pieces along a side of the mesh, rad; None: `mesh.TURN`.
+        """
+        if self.solid is not None:
+            return self, self.current.mesh()
+        if turns is None or len(turns) != len(self.sides.shape.pieces):
+            return self, self.plane.mesh(finer=())
+        return self, self.plane.mesh(finer=(), turn=turns)
+
+    def followed(self, mesh: Mesh) -> Mesh | None:
+        """Return a mesh of sides nearby, moved to these; None where its triangles are spoilt."""
+        if isinstance(mesh, PlateMesh):
+            face = self.followed(mesh.face)
+            if not isinstance(face, BodyMesh):
+                return None
+            return replace(extruded(face, mesh.thickness, mesh.layers), further=mesh.further)
+        assert isinstance(mesh, BodyMesh)
+        if len(mesh.shape.pieces) != len(self.sides.shape.pieces):
+            return None
+        found = mesh.morphed(self.sides.shape)
+        return None if found.quality.min() < WORN else found
+
+    def by_x(self, mesh: Mesh, by_nodes: np.ndarray) -> np.ndarray:
+        """Return derivatives (m, count) by x from those (m, n, d) by the nodes of its mesh."""
+        if isinstance(mesh, PlateMesh):
+            flat = np.array([mesh.at_face(row) for row in by_nodes])
+            return self.by_x(mesh.face, flat)
+        assert isinstance(mesh, BodyMesh)
+        g = mesh.at_outline(by_nodes)
+        found = np.zeros((len(g), self.sides.numbers[0]))
+        for number, one in enumerate(self.sides.placed):
+            here = np.flatnonzero(mesh.piece == number)
+            found += one.pull(mesh.span[here, 0], g[:, here], len(here))
+        return found @ self._ties
+
+    def size_by_x(self) -> np.ndarray:
+        """Return the derivative (count,) of the size by x."""
+        return self.sides.area_by_q() * self._thickness @ self._ties
+
+    def scaled(self, part: PlanePart, factors: np.ndarray) -> FreeSides:
+        """Return the sides of a part that repeats this one's design, stretched by (2,) factors.
+
+        Raises:
+            InputError: circles would become ellipses, or the arm is a solid.
+        """
+        own = [side.curve for loop in self.sides.loops for side in loop.sides]
+        curves = [*own, *(piece.curve for ring in self.sides.fixed for piece in ring)]
+        if self.solid is not None or not all(c is None or isinstance(c, Line) for c in curves):
+            raise InputError(
+                f"--optimize: arm {part.name!r} repeats a design with circles, or of a solid "
+                "(arms.pattern), which it would stretch; leave --optimize out"
+            )
+        ratio = np.ones(self.sides.numbers[0])
+        loops = []
+        for i, loop in enumerate(self.sides.loops):
+            sides = []
+            for k, side in enumerate(loop.sides):
+                made = _stretched(side, factors)
+                sides.append(made)
+                if (at := self.sides.numbers[1].get((i, k))) is not None:
+                    along = factors * unit(side.angle)
+                    out = factors * -left(unit(side.angle))
+                    ratio[at] = out @ -left(unit(made.angle))
+                    ratio[at + 1] = factors.prod() / (along @ along)
+            corners = [replace(c, place=c.place * factors) for c in loop.corners]
+            loops.append(Loop(tuple(sides), tuple(corners)))
+        circles = tuple(replace(c, centre=c.centre * factors) for c in self.sides.circles)
+        for k in range(len(circles)):
+            at = self.sides.of_circles + 3 * k
+            ratio[at : at + 2] = factors
+        # Not centred: its sides turn about the images of the other's middles.
+        made = replace(self.sides, loops=tuple(loops), circles=circles)
+        return replace(self, part=part, sides=made, repeated=ratio[:, None] * self.sides.ties)
+
+    # -- what a killed search goes on from ---------------------------------------------------
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What `restored` makes it of."""
+        edges = self.part.domain.edges
+        rows, corners, sizes = [], [], []
+        for loop in self.sides.loops:
+            sizes.append(len(loop.sides))
+            for side, corner in zip(loop.sides, loop.corners, strict=True):
+                turned = side.edge >= 0 and side.curve is not edges[side.edge].curve
+                numbers = side.edge, turned, side.key, side.twin
+                rows.append([*side.point, side.angle, *map(float, numbers)])
+                corners.append([*corner.place, corner.radius])
+        circles = [[*one.centre, one.radius, one.key, one.twin] for one in self.sides.circles]
+        return {
+            "sides": np.array(rows), "corners": np.array(corners), "sizes": np.array(sizes),
+            "circles": np.array(circles).reshape(-1, 5),
+            "pairs": np.array(self.sides.pairs).reshape(-1, 2),
+        }  # fmt: skip
+
+    def restored(self, arrays: Mapping[str, np.ndarray]) -> FreeSides:
+        """Return the sides of these `arrays`, of those that these have become."""
+        edges = self.part.domain.edges
+        sides, corners = [], [Corner(row[:2], float(row[2])) for row in arrays["corners"]]
+        for x, y, angle, edge, turned, key, twin in arrays["sides"]:
+            own = edges[int(edge)] if edge >= 0 else None
+            curve = None if own is None else own.curve.reversed() if turned else own.curve
+            label = "" if own is None else own.label
+            names = int(edge), int(key), int(twin)
+            sides.append(Side(np.array([x, y]), float(angle), curve, label, *names))
+        ends = np.cumsum([0, *arrays["sizes"]])
+        loops = [Loop(tuple(sides[a:b]), tuple(corners[a:b])) for a, b in pairwise(ends)]
+        circles = [
+            Circle(row[:2], float(row[2]), int(row[3]), int(row[4])) for row in arrays["circles"]
+        ]
+        pairs = tuple((int(a), int(b)) for a, b in arrays["pairs"])
+        made = replace(self.sides, loops=tuple(loops), circles=tuple(circles), pairs=pairs)
+        return replace(self, sides=made.centred())
+
+
+def _stretched(side: Side, factors: np.ndarray) -> Side:
+    """Return a straight side stretched by (2,) factors."""
+    if side.curve is None:
+        angle = angle_of(factors * unit(side.angle))
+        return replace(side, point=side.point * factors, angle=angle)
+    assert isinstance(side.curve, Line)
+    curve = Line(side.curve.start * factors, side.curve.end * factors)
+    return replace(side, point=side.point * factors, curve=curve)

@@ -1,0 +1,378 @@
+"""Limits of the geometry of sides: widths, gaps, radii, turns, lengths, and where material may be.
+
+Every limit is a row g + A x <= 0 with closed-form derivatives. Widths are measured from places
+along the outline to the exact nearest point of every other piece; of a pair of pieces the least
+and the farthest place count. The nearest outline that keeps all rows is found by a few of Newton's
+steps, each the shortest x with A x <= -g.
+Source: Lawson & Hanson, Solving Least Squares Problems (1995), doi:10.1137/1.9781611971217, 23.4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.spatial import cKDTree
+
+from dolfinopt.part.domain import Domain
+from dolfinopt.part.plane.curves import Arc, Curve, Line, Piece, Spline, curvature, direction
+from dolfinopt.part.plane.sides import (
+    GAUSS,
+    WEIGHTS,
+    ArcMoves,
+    BrokenError,
+    LineMoves,
+    OwnMoves,
+    Placed,
+    Sides,
+    turn_between,
+    unit,
+)
+
+if TYPE_CHECKING:
+    from shapely import Geometry
+
+SHORT = 0.05  # least length of a side, cells
+TURN, MOST_TURN = np.radians(4.0), np.radians(172.0)  # of the outline at a corner
+LARGEST = 8.0  # radius of a fillet, cells
+THIN = 1e-3  # m, least width of members unless the scene states one
+FACING = 0.8  # cosine between a width and the normals at both of its ends, at least
+RETURNS = 3  # from one side to the other and back, to where they are nearest
+NEAR = 2.0  # least widths: distance up to which two pieces are looked at
+HALF = 5e-4  # m, of which rounded radii are multiples
+CHORD = 0.005  # distance of polygons from curves, cells
+EXACTLY = 0.01  # of it, up to which an area may be, over the slope
+KEPT = 2e-6  # m, up to which a limit may be missed
+FARTHEST = 0.5  # cells that a side moves in a step to the nearest outline
+STEPS = 20  # of them, at most
+
+Rows = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What the sides of one part must keep.
+
+    Attributes:
+        cell: of the design, m.
+        tool: least radius of concave corners, m.
+        member, gap: least widths, m.
+        arm, stays: where material may be, and where it must be (shapely).
+    """
+
+    cell: float
+    tool: float
+    member: float
+    gap: float
+    arm: Geometry
+    stays: Geometry
+
+    def rows(self, sides: Sides) -> Rows:
+        """Return g (m,), m, which must not be positive, and its derivatives (m, count) by x.
+
+        Raises:
+            BrokenError: sides do not close to a loop.
+        """
+        found = [*self._of_pieces(sides), *self._of_sharp_corners(sides)]
+        found += [*self._widths(sides), *self._places(sides)]
+        if not found:
+            return np.empty(0), np.empty((0, sides.count))
+        values, slopes = zip(*found, strict=True)
+        A = np.array(slopes) @ sides.ties
+        moves = np.abs(A).max(axis=1, initial=0.0) > 1e-9  # others are the arm's own
+        return np.array(values)[moves], A[moves]
+
+    def _turn(self, turn: float, slope: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield the rows of a corner's turn, as lengths."""
+        reach = 4.0 * self.cell
+        yield reach * (TURN - turn), -reach * slope
+        yield reach * (turn - MOST_TURN), reach * slope
+
+    def _of_pieces(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield the rows of lengths, turns of fillets and radii."""
+        for one in sides.placed:
+            curve, moves = one.piece.curve, one.moves
+            if isinstance(moves, ArcMoves):
+                assert isinstance(curve, Arc)
+                if one.fillet:
+                    yield from self._turn(-curve.sweep, moves.start - moves.end)
+                yield self.tool - curve.radius, -moves.radius
+                yield curve.radius - LARGEST * self.cell, moves.radius
+            elif isinstance(moves, LineMoves):
+                side = sides.loops[one.loop].sides[one.side]
+                d = unit(side.angle) if side.curve is None else direction(side.curve, 0.0)
+                length = float((curve.end - curve.start) @ d)
+                yield SHORT * self.cell - length, -d @ (moves.end - moves.start)
+            elif isinstance(moves, OwnMoves):
+                speed = np.linalg.norm(curve.derivative(GAUSS), axis=1)
+                ends = np.linalg.norm(curve.derivative(np.array([0.0, 1.0])), axis=1)
+                slope = ends[1] * moves.end - ends[0] * moves.start
+                yield SHORT * self.cell - float(WEIGHTS @ speed), -slope
+
+    def _of_sharp_corners(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
+        placed = {(one.loop, one.side): one for one in sides.placed if not one.fillet}
+        for i, loop in enumerate(sides.loops):
+            for k, corner in enumerate(loop.corners):
+                a, b = loop.sides[k - 1], loop.sides[k]
+                if corner.radius > 0.0 or not (a.free or b.free):
+                    continue
+                before, after = placed[i, (k - 1) % len(loop.sides)], placed[i, k]
+                ends = direction(before.piece.curve, 1.0), direction(after.piece.curve, 0.0)
+                slope = _angle(sides, after, 0) - _angle(sides, before, 1)
+                yield from self._turn(turn_between(*ends), slope)
+
+    # -- widths of members and gaps ---------------------------------------------------------------
+
+    def _widths(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
+        every = [*sides.placed, *(Placed(one, None) for ring in sides.fixed for one in ring)]
+        every = [part for one in every for part in _chords(one, CHORD * self.cell)]
+        number, _, at, _ = _samples(every, self.cell)
+        most = NEAR * max(self.member, self.gap)
+        pairs = cKDTree(at).query_pairs(most + self.cell, output_type="ndarray")
+        pairs = np.vstack([pairs, pairs[:, ::-1]])
+        place, other = np.unique(np.stack([pairs[:, 0], number[pairs[:, 1]]]), axis=1)
+        apart = ~_together(every, sides)[number[place], other]
+        place, other = place[apart], other[apart]
+        own, curves = number[place], [one.piece.curve for one in every]
+        where, near, back = _closest(curves, other, at[place])
+        some = np.linalg.norm(near - at[place], axis=1) < most
+        own, other, near = own[some], other[some], near[some]
+        # Places stand apart: from one curve to the other and back they come to the narrowest one.
+        for _ in range(RETURNS):
+            s, p, out = _closest(curves, own, near)
+            where, near, back = _closest(curves, other, p)
+        v = near - p
+        width = np.linalg.norm(v, axis=1)
+        cosines = (v * out).sum(axis=1), (v * back).sum(axis=1)
+        for sign, least in ((-1.0, self.member), (1.0, self.gap)):
+            some = np.flatnonzero(
+                (width > 1e-9)
+                & (width < NEAR * least)
+                & (sign * cosines[0] > FACING * width)
+                & (-sign * cosines[1] > FACING * width)
+            )
+            key = np.sort(np.stack([own[some], other[some]]), axis=0)
+            _, group = np.unique(key, axis=1, return_inverse=True)
+            for one in range(group.max(initial=-1) + 1):
+                here = some[group.ravel() == one]
+                low = here[np.argmin(width[here])]
+                same = here[own[here] == own[low]]
+                far = same[np.argmax(np.abs(s[same] - s[low]))]
+                for k in {low, far}:
+                    u, slope = v[k] / width[k], np.zeros(sides.numbers[0])
+                    for which, t, g in ((own[k], s[k], u), (other[k], where[k], -u)):
+                        if every[which].moves is not None:
+                            slope = slope + every[which].pull(np.array([t]), g[None, None])[0]
+                    yield least - width[k], slope
+
+    # -- where material may be and must be --------------------------------------------------------
+
+    def _places(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
+        # Fillets lie between their sides.
+        moving = [one for one in sides.placed if one.piece.free and not one.fillet]
+        if not moving:
+            return
+        number, t, at, _ = _samples(moving, self.cell)
+        for region, sign in ((self.stays, -1.0), (self.arm, 1.0)):
+            if region.is_empty:
+                continue
+            distance, slope = _signed(region, at)
+            for k, one in enumerate(moving):
+                here = np.flatnonzero(number == k)
+                worst = here[np.argmax(sign * distance[here])]
+                value = sign * distance[worst]
+                if value > -self.cell:
+                    g = sign * slope[worst]
+                    yield value - 0.5 * KEPT, one.pull(t[worst : worst + 1], g[None, None])[0]
+
+    # -- the nearest outline that keeps them -------------------------------------------------------
+
+    def nearest(
+        self, sides: Sides, steps: int = STEPS, area: float | None = None
+    ) -> tuple[Sides, np.ndarray] | None:
+        """Return the nearest outline that keeps all limits, and the step x to it; None: none.
+
+        Args:
+            sides: where to begin.
+            steps: of Newton's, at most.
+            area: that it shall have besides, m2.
+        """
+        whole = np.zeros(sides.count)
+        for _ in range(steps):
+            try:
+                g, A = self.rows(sides)
+                margin = np.full(len(g), 0.3 * KEPT)
+                if area is not None:
+                    slope = sides.area_by_q() @ sides.ties
+                    whole_slope = EXACTLY * np.abs(slope).sum() or 1.0
+                    missing = (area - sides.shape.area) / whole_slope * np.array([1.0, -1.0])
+                    g, margin = np.append(g, missing), np.append(margin, [0.0, 0.0])
+                    A = np.vstack([A, np.outer([-1.0, 1.0], slope / whole_slope)])
+                if g.max(initial=-1.0) < KEPT:
+                    return (sides, whole) if self.is_simple(sides) else None
+                some = g > -FARTHEST * self.cell
+                x = least_move(A[some], -g[some] - margin[some])
+                if x is None or (size := np.abs(x).max()) > 6.0 * FARTHEST * self.cell:
+                    return None
+                x = x * min(1.0, FARTHEST * self.cell / size)
+                sides, whole = sides.moved(sides.ties @ x), whole + x
+            except BrokenError:
+                return None
+        return None
+
+    def is_simple(self, sides: Sides) -> bool:
+        """Return whether no side crosses another one."""
+        return sides.shape.is_simple(CHORD * self.cell)
+
+
+def limits_of_part(
+    domain: Domain, tool: float, minimum_gap: float = 0.0, scale: float = 1.0
+) -> Limits:
+    """Return the limits of an arm's part.
+
+    Args:
+        domain: the arm.
+        tool: radius, m.
+        minimum_gap: least width of gaps, m; they are as wide as the tool whatever it is.
+        scale: least factor by which arms that repeat this one's design are smaller than it.
+    """
+    chord = CHORD * domain.cell
+    arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
+    stays = domain.solid.area_inside(chord).intersection(arm)
+    member = (domain.minimum_member or THIN) / scale
+    return Limits(domain.cell, tool, member, max(2.0 * tool, minimum_gap) / scale, arm, stays)
+
+
+def rounded_radii(sides: Sides, limits: Limits) -> Sides:
+    """Return sides with radii of whole half millimetres, none below the tool's, all limits kept.
+
+    Where that cannot be, the radii stay as they are.
+    """
+
+    def whole(radius: float) -> float:
+        steps = round(radius / HALF), np.ceil(limits.tool / HALF - 1e-9), 1
+        return float(HALF * max(steps))
+
+    loops = tuple(
+        replace(
+            loop,
+            corners=tuple(
+                replace(c, radius=whole(c.radius)) if c.radius > 0.0 else c for c in loop.corners
+            ),
+        )
+        for loop in sides.loops
+    )
+    circles = tuple(replace(one, radius=whole(one.radius)) for one in sides.circles)
+    made = replace(sides, loops=loops, circles=circles, holds_radii=True)
+    found = limits.nearest(made, area=sides.shape.area) or limits.nearest(made)
+    return sides if found is None else replace(found[0], holds_radii=False)
+
+
+def least_move(A: np.ndarray, b: np.ndarray) -> np.ndarray | None:
+    """Return the shortest x with A x <= b, m; None where there is none."""
+    G, h = -1e3 * A, -1e3 * b  # mm
+    E, f = np.vstack([G.T, h]), np.zeros(A.shape[1] + 1)
+    f[-1] = 1.0
+    try:
+        r = E @ nnls(E, f, maxiter=50 * len(h))[0] - f
+    except RuntimeError:  # it goes round in circles
+        return None
+    return None if abs(r[-1]) < 1e-12 else -r[:-1] / r[-1]
+
+
+def _angle(sides: Sides, one: Placed, end: int) -> np.ndarray:
+    """Return the derivative (n,) by q of the direction's angle at an end of a side."""
+    count, of_sides, _ = sides.numbers
+    found = np.zeros(count)
+    if (at := of_sides.get((one.loop, one.side))) is not None:
+        found[at + 1] = 1.0
+    elif isinstance(one.moves, OwnMoves):
+        t = np.array([float(end)])
+        speed = np.linalg.norm(one.piece.curve.derivative(t))
+        by_t = (one.moves.start, one.moves.end)[end]
+        found = curvature(one.piece.curve, t)[0] * speed * by_t
+    return found
+
+
+def _chords(one: Placed, chord: float) -> list[Placed]:
+    """Return a piece; in place of a spline of the arm's own the lines along it, which stay."""
+    curve = one.piece.curve
+    if not isinstance(curve, Spline):
+        return [one]
+    points = curve.at(curve.parameters(chord))
+    return [
+        Placed(Piece(Line(a, b), one.piece.label), None, one.loop, one.side)
+        for a, b in pairwise(points)
+    ]
+
+
+def _samples(every: list[Placed], spacing: float) -> tuple[np.ndarray, ...]:
+    """Return places along pieces: number of the piece, parameter, point and outward normal."""
+    rows = []
+    for number, one in enumerate(every):
+        curve = one.piece.curve
+        is_line = isinstance(curve, Line)
+        length = float(np.linalg.norm(curve.derivative(np.array([0.5]))))
+        if not length > 0.0:
+            raise BrokenError("a side or a fillet vanishes")
+        count = max(3 if is_line else 5, int(length / spacing) + 1)
+        t = np.linspace(0.0, 1.0, count)
+        d = curve.derivative(t)
+        d = d / np.linalg.norm(d, axis=1)[:, None]
+        out = np.stack([d[:, 1], -d[:, 0]], axis=1)
+        rows.append((np.full(count, number), t, curve.at(t), out))
+    number, t, at, out = zip(*rows, strict=True)
+    return np.concatenate(number), np.concatenate(t), np.vstack(at), np.vstack(out)
+
+
+def _together(every: list[Placed], sides: Sides) -> np.ndarray:
+    """Return which pairs (n, n) of pieces are the same, share a corner, or are next to it."""
+    loop = np.array([one.loop for one in every])
+    side = np.array([one.side for one in every])
+    size = np.array([len(sides.loops[i].sides) if i >= 0 else 1 for i in loop])
+    steps = (side[:, None] - side) % size[:, None]
+    beside = (steps <= 1) | (steps == size[:, None] - 1)
+    found = (loop[:, None] == loop) & (loop >= 0) & beside
+    stays = np.array([one.moves is None for one in every])
+    return found | (stays[:, None] & stays) | np.eye(len(every), dtype=bool)
+
+
+def _closest(
+    curves: Sequence[Curve], number: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return parameter (k,), place and outward normal (k, 2) of the nearest points to p (k, 2)."""
+    # `number` (k,): of the line or arc that each point is compared with.
+    line = np.array([isinstance(c, Line) for c in curves])
+    start = np.array([c.centre if isinstance(c, Arc) else c.start for c in curves])
+    d = np.array([[c.radius, 0.0] if isinstance(c, Arc) else c.end - c.start for c in curves])
+    begin = np.array([c.begin if isinstance(c, Arc) else 0.0 for c in curves])
+    sweep = np.array([c.sweep if isinstance(c, Arc) else 1.0 for c in curves])
+    is_line, s, v, b, w = line[number], start[number], d[number], begin[number], sweep[number]
+    r = p - s
+    t = np.clip((r * v).sum(axis=1) / (v * v).sum(axis=1), 0.0, 1.0)
+    angle = np.arctan2(r[:, 1], r[:, 0]) - b
+    u = (np.sign(w) * angle % (2.0 * np.pi)) / np.abs(w)
+    beyond = np.where(u > 0.5 + np.pi / np.abs(w), 0.0, 1.0)
+    t = np.where(is_line, t, np.where(u > 1.0, beyond, u))
+    e = np.stack([np.cos(b + w * t), np.sin(b + w * t)], axis=1)
+    at = np.where(is_line[:, None], s + t[:, None] * v, s + v[:, :1] * e)
+    along = v / np.linalg.norm(v, axis=1)[:, None]
+    normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    return t, at, np.where(is_line[:, None], normal, np.sign(w)[:, None] * e)
+
+
+def _signed(region: Geometry, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances (k,) from a region, negative inside, and their derivatives (k, 2) by p."""
+    import shapely
+
+    points, edge = shapely.points(p), region.boundary
+    shapely.prepare(region)
+    lines = shapely.get_coordinates(shapely.shortest_line(edge, points)).reshape(-1, 2, 2)
+    away = p - lines[:, 0]
+    distance = np.linalg.norm(away, axis=1)
+    sign = np.where(shapely.contains(region, points), -1.0, 1.0)
+    return sign * distance, (sign / np.maximum(distance, 1e-12))[:, None] * away

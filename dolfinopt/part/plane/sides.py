@@ -1,0 +1,545 @@
+"""The outline of a plane part as an engineer draws it: straight sides, fillets and circles.
+
+A loop is a cyclic list of sides with a corner before each; material is to the left. A side is a
+line that moves, or a curve of the arm's own. A corner is sharp, or has a fillet: its centre c has
+the distance r from both sides, outwards along their normals n,
+
+    n_i . (c - f_i) = r,   f_i the foot of c on side i.
+
+Variables q are the offset along its normal and the turn about its middle of every line that moves,
+the radius of every fillet, and centre and radius of every circle. Derivatives are closed forms:
+
+    centre       n_i . dc = dr + dd_i - ((f_i - m_i) . t_i) da_i
+    touch point  P_i = c - r n_i,   dP_i = dc - n_i dr - r n'_i dA_i
+    turn         dA_i = da_i of a line, t_i . dc k / (1 + k r) of a curve with curvature k
+
+with t_i along side i, n'_i its normal turned by a right angle and m_i the middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from dolfinopt.part.plane.curves import (
+    MIRROR,
+    Arc,
+    Curve,
+    Line,
+    Piece,
+    Shape,
+    Spline,
+    curvature,
+    direction,
+    projected,
+)
+
+PARALLEL = 1e-4  # sine of the angle between two sides below which they do not meet
+MEETINGS = 40  # of Newton's steps to where two sides meet
+CLOSE = 1e-13  # m, last of these steps
+GAUSS, WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(12), (1.0, 0.0)))
+
+
+class BrokenError(Exception):
+    """The sides do not close to a loop."""
+
+
+def unit(angle: float) -> np.ndarray:
+    """Return the unit vector (2,) at an angle, rad."""
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def left(v: np.ndarray) -> np.ndarray:
+    """Return a vector (2,) turned by a right angle to the left."""
+    return np.array([-v[1], v[0]])
+
+
+def angle_of(v: np.ndarray) -> float:
+    """Return the angle of a vector (2,), rad."""
+    return float(np.arctan2(v[1], v[0]))
+
+
+def turn_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the angle from one vector (2,) to another, positive to the left, rad."""
+    return float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """A line that moves, or a curve of the arm's own.
+
+    Attributes:
+        point: (2,) middle of a line that moves, m.
+        angle: of its direction, rad.
+        curve: of the arm's own; None: a line that moves.
+        label: "inboard", "outboard" or "".
+        edge: number of the arm's curve among `Domain.edges`; -1: none.
+        key, twin: its name, and that of its mirror image, which may be itself; -1: none.
+    """
+
+    point: np.ndarray
+    angle: float = 0.0
+    curve: Curve | None = None
+    label: str = ""
+    edge: int = -1
+    key: int = -1
+    twin: int = -1
+
+    @property
+    def free(self) -> bool:
+        """Whether it moves."""
+        return self.curve is None
+
+    def foot(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the nearest point (2,) of the side, its direction (2,) and curvature there."""
+        if self.curve is None:
+            along = unit(self.angle)
+            return self.point + ((place - self.point) @ along) * along, along, 0.0
+        point, t = projected(self.curve, place)
+        at = min(max(t, 0.0), 1.0)
+        if isinstance(self.curve, Arc):
+            bend = np.sign(self.curve.sweep) / self.curve.radius
+            along = left(point - self.curve.centre) * bend
+            return point, along, float(bend)
+        return point, direction(self.curve, at), float(curvature(self.curve, np.array([at]))[0])
+
+    def moved(self, offset: float, turn: float) -> Side:
+        """Return a line that moves, moved outwards, m, and turned to the left, rad."""
+        point = self.point - offset * left(unit(self.angle))
+        return replace(self, point=point, angle=self.angle + turn)
+
+    def mirrored(self) -> Side:
+        """Return the mirror image about y = 0, run through with the material to the left."""
+        curve = None if self.curve is None else self.curve.mirrored().reversed()
+        return replace(
+            self,
+            point=self.point * MIRROR,
+            angle=np.pi - self.angle,
+            curve=curve,
+            key=self.twin,
+            twin=self.key,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Corner:
+    """Where two sides meet: about where (2,), m, and the radius of its fillet, m; 0: sharp."""
+
+    place: np.ndarray
+    radius: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """Sides around the material or around a hole; corner k is before side k."""
+
+    sides: tuple[Side, ...]
+    corners: tuple[Corner, ...]
+
+    @property
+    def places(self) -> np.ndarray:
+        """Where its corners are (n, 2), m."""
+        return np.array([one.place for one in self.corners])
+
+    @property
+    def area(self) -> float:
+        """Area within its corners, m2, positive counterclockwise."""
+        x, y = self.places.T
+        return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """A round hole that moves; key and twin as of sides."""
+
+    centre: np.ndarray
+    radius: float
+    key: int = -1
+    twin: int = -1
+
+
+def meet(a: Side, b: Side, reach: float, near: np.ndarray) -> np.ndarray:
+    """Return the point (2,) at an outward distance from both sides, m, that is nearest to another.
+
+    Raises:
+        BrokenError: there is none.
+    """
+    place = near
+    for _ in range(MEETINGS):
+        feet = a.foot(place), b.foot(place)
+        normals = np.array([-left(along) for _, along, _ in feet])
+        gaps = [reach - n @ (place - foot) for n, (foot, _, _) in zip(normals, feet, strict=True)]
+        (p, q), (r, s) = normals
+        if abs(sine := p * s - q * r) < PARALLEL:
+            break
+        step = np.array([s * gaps[0] - q * gaps[1], p * gaps[1] - r * gaps[0]]) / sine
+        place = place + step
+        if np.abs(step).max() < CLOSE:
+            return place
+    x, y = 1e3 * near
+    raise BrokenError(f"two sides do not meet near ({x:.1f}, {y:.1f}) mm")
+
+
+# -- pieces of the outline and how they move -------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LineMoves:
+    """Derivatives (2, n) by q of both ends of a line."""
+
+    start: np.ndarray
+    end: np.ndarray
+
+    def pull(self, curve: Line, t: np.ndarray, g: np.ndarray, count: int = 0) -> np.ndarray:
+        """Return sum_k g_k . dp(t_k)/dq (m, n) for t (k,) and g (m, k, 2)."""
+        return np.einsum("k,mkd,dn->mn", 1.0 - t, g, self.start) + np.einsum(
+            "k,mkd,dn->mn", t, g, self.end
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class OwnMoves:
+    """Derivatives (n,) by q of the parameter at both ends of a curve of the arm's own."""
+
+    start: np.ndarray
+    end: np.ndarray
+
+    def pull(self, curve: Curve, t: np.ndarray, g: np.ndarray, count: int = 0) -> np.ndarray:
+        """Return sum_k g_k . dp(t_k)/dq, see `LineMoves.pull`."""
+        along = (g * curve.derivative(t)).sum(axis=2)
+        return np.outer(along @ (1.0 - t), self.start) + np.outer(along @ t, self.end)
+
+
+@dataclass(frozen=True, eq=False)
+class ArcMoves:
+    """Derivatives by q of an arc's centre (2, n), radius (n,) and angles at both ends (n,)."""
+
+    centre: np.ndarray
+    radius: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
+
+    def pull(self, curve: Arc, t: np.ndarray, g: np.ndarray, count: int = 0) -> np.ndarray:
+        """Return sum_k g_k . dp(t_k)/dq, see `LineMoves.pull`.
+
+        With a count of sides it is that of nodes of a mesh, which stand off the arc (`Arc.off`).
+        """
+        angle = curve.begin + curve.sweep * t
+        out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        share, slope = curve.off(t, count)
+        turns = np.outer((g * out).sum(axis=2) @ (curve.radius * slope), self.end - self.start)
+        along = (g * np.stack([-out[:, 1], out[:, 0]], axis=1)).sum(axis=2)
+        along = along * (curve.radius * share)
+        return (
+            g.sum(axis=1) @ self.centre
+            + np.outer((g * out).sum(axis=2) @ share, self.radius)
+            + np.outer(along @ (1.0 - t), self.start)
+            + np.outer(along @ t, self.end)
+            + turns
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A piece of the outline, how it moves, and which loop and side, or corner, it is.
+
+    Attributes:
+        piece, moves: moves are None of what stays.
+        loop: number of its loop; -1 of circles and of what stays.
+        side: number of the side, or of the corner.
+        fillet: whether it is a fillet.
+    """
+
+    piece: Piece
+    moves: LineMoves | OwnMoves | ArcMoves | None
+    loop: int = -1
+    side: int = -1
+    fillet: bool = False
+
+    def pull(self, t: np.ndarray, g: np.ndarray, count: int = 0) -> np.ndarray:
+        """Return sum_k g_k . dp(t_k)/dq (m, n), see `LineMoves.pull`."""
+        assert self.moves is not None
+        return self.moves.pull(self.piece.curve, t, g, count)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class _Touch:
+    """Where a corner's fillet touches a side: point, normal, their derivatives."""
+
+    point: np.ndarray
+    normal: np.ndarray
+    by_point: np.ndarray  # (2, n)
+    by_angle: np.ndarray  # (n,)
+
+
+Loops = tuple[Loop, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Sides:
+    """The outline of a part.
+
+    Attributes:
+        loops: of sides, the outer one first.
+        circles: round holes that move.
+        fixed: loops of the arm's own curves: bores.
+        pairs: keys of sides that stay parallel.
+        holds_radii: whether radii stay as they are.
+    """
+
+    loops: Loops
+    circles: tuple[Circle, ...] = ()
+    fixed: tuple[tuple[Piece, ...], ...] = ()
+    pairs: tuple[tuple[int, int], ...] = ()
+    holds_radii: bool = False
+
+    @cached_property
+    def numbers(self) -> tuple[int, Mapping[tuple[int, int], int], Mapping[tuple[int, int], int]]:
+        """How many q there are; where the offset of each side, and each radius, stand in q."""
+        count, sides, corners = 0, {}, {}
+        for i, loop in enumerate(self.loops):
+            for k, side in enumerate(loop.sides):
+                if side.free:
+                    sides[i, k], count = count, count + 2
+            for k, corner in enumerate(loop.corners):
+                if corner.radius > 0.0:
+                    corners[i, k], count = count, count + 1
+        return count + 3 * len(self.circles), sides, corners
+
+    @property
+    def of_circles(self) -> int:
+        """Where the first circle's centre stands in q."""
+        return self.numbers[0] - 3 * len(self.circles)
+
+    # -- the curves ---------------------------------------------------------------------------
+
+    @cached_property
+    def shape(self) -> Shape:
+        """The outline in curves."""
+        loops = [
+            tuple(one.piece for one in self.placed if one.loop == i) for i in range(len(self.loops))
+        ]
+        rings = [(one.piece,) for one in self.placed if one.loop < 0]
+        whole = [*loops, *rings, *self.fixed]
+        return Shape(tuple(sorted(whole, key=_enclosed, reverse=True)))
+
+    @cached_property
+    def placed(self) -> list[Placed]:
+        """All pieces that may move, in the order of the shape's.
+
+        Raises:
+            BrokenError: sides do not close to a loop.
+        """
+        return [*self._of_loops(), *self._of_circles()]
+
+    def _of_circles(self) -> Iterator[Placed]:
+        count, first = self.numbers[0], self.of_circles
+        every, still = np.eye(count), np.zeros(count)
+        for k, one in enumerate(self.circles):
+            at = first + 3 * k
+            moves = ArcMoves(every[at : at + 2], every[at + 2], still, still)
+            ring = Arc(one.centre, one.radius, 0.0, -2.0 * np.pi)
+            yield Placed(Piece(ring, free=True), moves)
+
+    def _of_loops(self) -> Iterator[Placed]:
+        for i, loop in enumerate(self.loops):
+            met = [self._meeting(i, k) for k in range(len(loop.sides))]
+            for k, side in enumerate(loop.sides):
+                (centre, by_centre, by_radius), before, after = met[k]
+                if loop.corners[k].radius > 0.0:
+                    turn = turn_between(before.normal, after.normal)
+                    begin = angle_of(-before.normal)
+                    arc = Arc(centre, loop.corners[k].radius, begin, turn)
+                    moves = ArcMoves(by_centre, by_radius, before.by_angle, after.by_angle)
+                    yield Placed(Piece(arc, free=True), moves, i, k, True)
+                yield _side(side, after, met[(k + 1) % len(met)][1], i, k)
+
+    def _meeting(self, i: int, k: int) -> tuple[tuple[np.ndarray, ...], _Touch, _Touch]:
+        """Return a corner's centre with derivatives, and where it touches the sides beside it."""
+        loop, (count, of_sides, of_corners) = self.loops[i], self.numbers
+        corner, beside = loop.corners[k], ((k - 1) % len(loop.sides), k)
+        a, b = (loop.sides[j] for j in beside)
+        radius, by_radius = corner.radius, np.zeros(count)
+        if radius > 0.0:
+            by_radius[of_corners[i, k]] = 1.0
+        stays = radius == 0.0 and not a.free and not b.free
+        centre = corner.place if stays else meet(a, b, radius, corner.place)
+        by_centre, feet = np.zeros((2, count)), (a.foot(centre), b.foot(centre))
+        rows, angles = [], []
+        for j, side, (foot, along, _) in zip(beside, (a, b), feet, strict=True):
+            row, angle = by_radius.copy(), np.zeros(count)
+            if side.free:
+                at = of_sides[i, j]
+                row[at] += 1.0
+                row[at + 1] -= (foot - side.point) @ along
+                angle[at + 1] = 1.0
+            rows.append(row)
+            angles.append(angle)
+        if not stays:
+            by_centre = np.linalg.solve([-left(along) for _, along, _ in feet], rows)
+        touches = []
+        for side, (_, along, bend), angle in zip((a, b), feet, angles, strict=True):
+            if not side.free:
+                angle = bend / (1.0 + bend * radius) * (along @ by_centre)
+            out = -left(along)
+            by_point = by_centre - np.outer(out, by_radius) - radius * np.outer(along, angle)
+            touches.append(_Touch(centre - radius * out, out, by_point, angle))
+        return (centre, by_centre, by_radius), touches[0], touches[1]
+
+    def moved(self, q: np.ndarray) -> Sides:
+        """Return the outline after a step of q; sides turn about their new middles from then on.
+
+        Raises:
+            BrokenError: the sides do not close any more.
+        """
+        _, sides, corners = self.numbers
+        loops = []
+        for i, loop in enumerate(self.loops):
+            made = tuple(
+                side.moved(*q[at : at + 2]) if (at := sides.get((i, k), -1)) >= 0 else side
+                for k, side in enumerate(loop.sides)
+            )
+            rounded = tuple(
+                replace(one, radius=one.radius + q[corners[i, k]]) if one.radius > 0.0 else one
+                for k, one in enumerate(loop.corners)
+            )
+            loops.append(Loop(made, rounded))
+        steps = q[self.of_circles :].reshape(-1, 3)
+        circles = tuple(
+            replace(one, centre=one.centre + step[:2], radius=one.radius + step[2])
+            for one, step in zip(self.circles, steps, strict=True)
+        )
+        return replace(self, loops=tuple(loops), circles=circles).centred()
+
+    def centred(self) -> Sides:
+        """Return the same outline with sides known by their middles, corners by their places."""
+        at = {(one.loop, one.side, one.fillet): one.piece.curve for one in self.placed}
+        loops = []
+        for i, loop in enumerate(self.loops):
+            sides, corners = [], []
+            for k, (side, corner) in enumerate(zip(loop.sides, loop.corners, strict=True)):
+                curve = at[i, k, False]
+                middle = 0.5 * (curve.start + curve.end)
+                sides.append(replace(side, point=middle) if side.free else side)
+                arc = at.get((i, k, True))
+                place = arc.centre if isinstance(arc, Arc) else curve.start
+                corners.append(replace(corner, place=place))
+            loops.append(Loop(tuple(sides), tuple(corners)))
+        return replace(self, loops=tuple(loops))
+
+    # -- ties: mirror images, parallel sides -----------------------------------------------------
+
+    @cached_property
+    def ties(self) -> np.ndarray:
+        """T (n, count) with q = T x; x are lengths, of turns the move of a side's end, m."""
+        count, sides, corners = self.numbers
+        at = {self.loops[i].sides[k].key: j for (i, k), j in sides.items()}
+        pairs: list[tuple[int, int, float]] = []
+        for (i, k), j in sides.items():
+            twin = self.loops[i].sides[k].twin
+            if twin in at:
+                pairs += [(j, at[twin], 1.0), (j + 1, at[twin] + 1, -1.0)]
+        ends = {self._beside(i, k): j for (i, k), j in corners.items()}
+        for (i, k), j in corners.items():
+            image = self._beside(i, k, twins=True)
+            if image in ends:
+                pairs.append((j, ends[image], 1.0))
+        rings = {one.key: self.of_circles + 3 * k for k, one in enumerate(self.circles)}
+        for one in self.circles:
+            if one.twin in rings:
+                j, twin = rings[one.key], rings[one.twin]
+                pairs += [(j, twin, 1.0), (j + 1, twin + 1, -1.0), (j + 2, twin + 2, 1.0)]
+        pairs += [(at[a] + 1, at[b] + 1, 1.0) for a, b in self.pairs if a in at and b in at]
+        # A line beside which the arm's own edge stays is held.
+        held = [at[a] + 1 for a, b in self.pairs if a in at and b not in at]
+        if self.holds_radii:
+            held += [*corners.values(), *range(self.of_circles + 2, count, 3)]
+        T = _tied(count, pairs, held)
+        half = np.ones(count)
+        for key, j in sides.items():
+            half[j + 1] = 0.5 * self._lengths[key]
+        return T / (np.abs(T) * half[:, None]).max(axis=0, initial=1e-9)
+
+    def _beside(self, i: int, k: int, twins: bool = False) -> tuple[int, int]:
+        """Return the keys of the sides before and after a corner, or those of its mirror image."""
+        before, after = self.loops[i].sides[k - 1], self.loops[i].sides[k]
+        return (after.twin, before.twin) if twins else (before.key, after.key)
+
+    @cached_property
+    def _lengths(self) -> dict[tuple[int, int], float]:
+        return {
+            (one.loop, one.side): float(np.linalg.norm(one.piece.curve.end - one.piece.curve.start))
+            for one in self.placed
+            if one.loop >= 0 and not one.fillet
+        }
+
+    @property
+    def count(self) -> int:
+        """Number of variables x."""
+        return self.ties.shape[1]
+
+    def area_by_q(self) -> np.ndarray:
+        """Return the derivative (n,) of the area by q: the integral of dp . outward ds, m."""
+        found = np.zeros(self.numbers[0])
+        for one in self.placed:
+            d = one.piece.curve.derivative(GAUSS)
+            out = np.stack([d[:, 1], -d[:, 0]], axis=1) * WEIGHTS[:, None]
+            found += one.pull(GAUSS, out[None])[0]
+        return found
+
+
+def _enclosed(loop: tuple[Piece, ...]) -> float:
+    """Return whether a loop goes around the material: 1, or around a hole: 0."""
+    return float(sum(piece.curve.area for piece in loop) > 0.0)
+
+
+def _side(side: Side, first: _Touch, last: _Touch, i: int, k: int) -> Placed:
+    """Return the piece of a side between where the fillets at its ends touch it."""
+    if side.curve is None or isinstance(side.curve, Line):
+        line = Line(first.point, last.point)
+        piece = Piece(line, side.label, side.free)
+        return Placed(piece, LineMoves(first.by_point, last.by_point), i, k)
+    curve = between(side.curve, first.point, last.point)
+    ends = [
+        d @ touch.by_point / (d @ d)
+        for touch, d in zip((first, last), curve.derivative(np.array([0.0, 1.0])), strict=True)
+    ]
+    return Placed(Piece(curve, side.label), OwnMoves(ends[0], ends[1]), i, k)
+
+
+def between(curve: Curve, start: np.ndarray, end: np.ndarray) -> Curve:
+    """Return the piece of an arc or a spline from one of its points to another."""
+    if isinstance(curve, Arc):
+        a, b = (angle_of(p - curve.centre) for p in (start, end))
+        sense = float(np.sign(curve.sweep))
+        return Arc(curve.centre, curve.radius, a, sense * ((sense * (b - a)) % (2.0 * np.pi)))
+    assert isinstance(curve, Spline)
+    (_, a), (_, b) = projected(curve, start), projected(curve, end)
+    if b - a < 1e-9:
+        raise BrokenError("a curve of the arm's own vanishes between two corners")
+    return curve.part(a, b)
+
+
+def _tied(
+    count: int, pairs: Sequence[tuple[int, int, float]], held: Sequence[int] = ()
+) -> np.ndarray:
+    """Return T (count, m) with one column for each group of variables that are tied with a sign."""
+    group, sign = np.arange(count), np.ones(count)
+    zero = np.zeros(count, dtype=bool)
+    zero[list(held)] = True
+    for a, b, same in pairs:
+        if group[a] != group[b]:
+            joins = group == group[b]
+            sign[joins] *= sign[a] * sign[b] * same
+            group[joins] = group[a]
+        elif sign[a] * sign[b] != same:
+            zero[group == group[a]] = True
+    gone = np.isin(group, group[zero])
+    names = np.unique(group[~gone])
+    T = np.zeros((count, len(names)))
+    rows = np.flatnonzero(~gone)
+    T[rows, np.searchsorted(names, group[rows])] = sign[rows]
+    return T

@@ -1,0 +1,409 @@
+"""Sequential quadratic programming over the sides of all arms.
+
+A step minimises the objective, linear, plus the curvature of the Lagrangian (damped BFGS) and the
+price of missed limits, all limits and the limits of the geometry linear, within a box; then the
+nearest outlines are taken that keep the geometry's limits. Stress has a row for every fillet or
+side that comes near its limit. Limits v count as 2 (1 - (1 + v)^-1/2), nearly linear in the width
+of what bends. A step is judged by the exact penalty; one that is spoilt by the stress of a place
+that was not differentiated is computed again with it, one spoilt by curvature corrected once.
+Source: Nocedal & Wright, Numerical Optimization (2006), doi:10.1007/978-0-387-40065-5, 18.5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.part.merit import judge_step
+from dolfinopt.part.plane.free_sides import FreeSides
+from dolfinopt.part.plane.sides import BrokenError
+from dolfinopt.part.problem import Place, Problem, State
+from dolfinopt.part.program import solve
+from dolfinopt.responses.constraints import EXCESS
+
+FAR = 0.6  # cells that a side's end, or a radius, moves in a step, at most
+FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.5, 2.0, 0.005  # of the trust region, of FAR
+FOLLOWED = 6  # steps that a mesh follows
+SETTLED = 1e-2  # relative fall of the objective on two new meshes that ends the search
+HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, steps that rows hold
+ATTEMPTS = 3  # at a step of one radius
+PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
+DEAR, RESTORING = 50.0, 3  # price of limits that shall be met above all; steps to that, at most
+FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
+ENDS = 1.5  # of the way of a side's end, that a corner may go in a step
+HARDLY = 1e-5  # relative fall that a step must promise
+SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
+PATIENCE = 3  # times that no step betters the parts on a mesh, before the search ends
+
+Tell = Callable[[str], None]
+
+
+def bent(v: np.ndarray) -> np.ndarray:
+    """Return 2 (1 - (1 + v)^-1/2) of constraints (m,)."""
+    return np.asarray(2.0 * (1.0 - np.maximum(1.0 + v, 0.05) ** -0.5))
+
+
+def bent_slope(v: np.ndarray) -> np.ndarray:
+    """Return its derivative (m,)."""
+    return np.asarray(np.maximum(1.0 + v, 0.05) ** -1.5)
+
+
+def damped(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the BFGS update of H (n, n) with Powell's damping; at first a multiple of one."""
+    if not s.any():
+        return H
+    if not H.any():
+        least = 0.05 * np.linalg.norm(s) * np.linalg.norm(y)
+        H = max(float(s @ y), least) / (s @ s) * np.eye(len(s))
+    Hs = H @ s
+    curve, found = float(s @ Hs), float(s @ y)
+    if curve <= 0.0:
+        return H
+    if found < 0.2 * curve:
+        share = 0.8 * curve / (curve - found)
+        y = share * y + (1.0 - share) * Hs
+    return np.asarray(H - np.outer(Hs, Hs) / curve + np.outer(y, y) / (s @ y))
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """All limits at one state, linear, and the size of its step.
+
+    Attributes:
+        slopes: (1 + m, n) of the objective and of the limits but for the stress.
+        hot: derivatives (n,) of the stress of places.
+        A, b: of the geometry's limits, A x <= b.
+        far: (n,) largest step, m.
+    """
+
+    slopes: np.ndarray
+    hot: Mapping[Place, np.ndarray]
+    A: np.ndarray
+    b: np.ndarray
+    far: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A trial step.
+
+    Attributes:
+        x: (n,) asked for.
+        promised: fall of the merit.
+        multipliers: (m,) of limits; places: those of places.
+        state, whole: what it leads to, and the whole step (n,) with the way to a valid outline.
+        anew: whether meshes were made anew.
+    """
+
+    x: np.ndarray
+    promised: float
+    multipliers: np.ndarray
+    places: Mapping[Place, float]
+    state: State
+    whole: np.ndarray
+    anew: bool
+    fall: float
+
+
+def sides_of(state: State) -> Mapping[int, FreeSides]:
+    """Return the forms of a state, all of which are sides."""
+    return cast(Mapping[int, FreeSides], state.outlines)
+
+
+class SidesSearch:
+    """Steps within a trust region from one state on.
+
+    Attributes:
+        best: the best state so far, on a mesh of its own; it may miss a limit by a little.
+        met: the best one that keeps all limits; None: there was none.
+        passed: outlines of the last mesh and of those since then.
+        steps: taken.
+        spent: whether no more iterations were allowed.
+    """
+
+    def __init__(self, problem: Problem, state: State):
+        """Begin at a state."""
+        self.problem, self.state, self.best = problem, state, state.released
+        self.met: State | None = None
+        self.passed = [dict(state.outlines)]
+        # Without stress there is nothing that a finer mesh of the first state would tell.
+        self.since, self.falls = FOLLOWED, list[float]()
+        if not state.places:
+            self.since, self.falls = 0, [float(self.best.values[0])]
+        self.steps, self.lost, self.spent = 0, 0, False
+        self.radius, self.price = FIRST_RADIUS, PRICE
+        self.H = np.zeros((0, 0))
+        self.rows: dict[Place, tuple[np.ndarray, int]] = {}
+        self.before: tuple[Step, Linear] | None = None
+
+    def run(self, iterations: int, tell: Tell, first: int) -> str:
+        """Take so many steps at most; return why the search ended."""
+        self.spent = False
+        while True:
+            if self.since >= FOLLOWED or self.steps >= iterations:
+                self._mesh_anew()
+                if self._settled() and not self._simplified():
+                    return "settled"
+            if self.steps >= iterations:
+                self.spent = True
+                return f"{first + iterations} iterations"
+            if not self._step():
+                self.lost += 1
+                if self.since == 0 or self.lost > PATIENCE:
+                    if self._simplified():
+                        continue
+                    return "no step betters the parts"
+                self.since, self.radius = FOLLOWED, max(self.radius, 0.1)
+                continue
+            self.steps += 1
+            tell(self._line(first + self.steps))
+
+    def restore(self, tell: Tell, first: int) -> None:
+        """Take a few steps that meet the limits above all; as many as that needs."""
+        if self.since >= FOLLOWED:
+            self._mesh_anew()
+        for _ in range(RESTORING):
+            self.price = DEAR
+            if self.state.values[1:].max(initial=0.0) <= EXCESS or not self._step():
+                break
+            self.steps += 1
+            tell(self._line(first + self.steps))
+
+    def _mesh_anew(self) -> None:
+        """Go on with new meshes; the state on them may be the best one."""
+        if self.falls and len(self.falls) % SIMPLER == 0:
+            self._simplified()
+        try:
+            self.problem, self.state = self.problem.calibrated(self.state)
+        except (ConvergenceError, InputError):  # sides that all but touch
+            outlines = self.best.outlines
+            fresh = self.problem.evaluated(outlines, {}, self.best.solutions)
+            self.problem, self.state = self.problem.calibrated(fresh)
+            self.radius *= 0.5
+        self.since, self.before = 0, None
+        self.passed = [dict(self.state.outlines)]
+        if not self.falls or self.state.rank <= self.best.rank:
+            self.best = self.state.released
+        self.falls.append(self.best.values[0])
+        self._keep_met()
+
+    def _keep_met(self) -> None:
+        """Keep the state if it meets all limits and is better than those before."""
+        values = self.state.values
+        if values[1:].max(initial=0.0) <= EXCESS:
+            if self.met is None or values[0] < self.met.values[0]:
+                self.met = self.state.released
+
+    def _simplified(self) -> bool:
+        """Go on without sides that have vanished and holes that close, if that costs little."""
+        before = self.state
+        for k, one in sides_of(before).items():
+            simpler, count = one.simplified()
+            if not count:
+                continue
+            plain = replace(self.problem, local={})
+            try:
+                outlines = {**self.state.outlines, k: simpler}
+                found = plain.evaluated(outlines, {}, self.state.solutions)
+            except (ConvergenceError, InputError):
+                continue
+            cost = self._merit(found, found) - self._merit(self.state, self.state)
+            if cost < WORSE * np.sqrt(count) * abs(self.state.values[0]):
+                self.problem, self.state, self.before = plain, found, None
+        return self.state is not before
+
+    def _settled(self) -> bool:
+        if len(self.falls) < 3 or self.best.values[1:].max(initial=0.0) > 5.0 * EXCESS:
+            return False
+        return bool(self.falls[-3] - self.falls[-1] < SETTLED * abs(self.falls[-1]))
+
+    def _line(self, number: int) -> str:
+        one = self.state
+        worst = one.values[1:].max(initial=0.0)
+        words = "limits met" if worst <= EXCESS else f"{100.0 * worst:.2g} % over a limit"
+        return (
+            f"{number} objective {one.simulated.evaluation.objective:.5g}, "
+            f"mass {one.mass:.4g} kg, {words}, trust region {self.radius:.2g}"
+        )
+
+    # -- a step -----------------------------------------------------------------------------------
+
+    def _step(self) -> bool:
+        """Take a step that lowers the merit; return whether there is one."""
+        state = self.state
+        slopes = self.problem.slopes(state)
+        places = state.places
+        self.rows = {
+            key: row
+            for key, row in self.rows.items()
+            if key in places and len(row[0]) == slopes.shape[1] and self.steps - row[1] <= OLD
+        }
+        hottest = sorted((k for k in places if places[k] > HOT), key=lambda k: -places[k])
+        self._learn(state, hottest[:MOST])
+        self._curved(slopes)
+        while self.radius > LEAST_RADIUS:
+            linear = self._linear(state, slopes)
+            tried = self._tried(state, linear)
+            if tried is None:
+                self.radius *= 0.5
+                continue
+            accepted, factor = judge_step(0.0, -tried.fall, -tried.promised)
+            if tried.promised < HARDLY * abs(state.values[0]) and not accepted:
+                return False
+            self.radius = min(LARGEST_RADIUS, factor * self.radius)
+            if accepted and tried.fall > 0.0:
+                self._take(state, tried, linear)
+                return True
+        return False
+
+    def _take(self, state: State, step: Step, linear: Linear) -> None:
+        dual = max([*step.multipliers, sum(step.places.values())], default=0.0)
+        dual /= abs(state.values[0])
+        if dual < 0.5 * self.price:  # a price far above the multipliers makes steps short
+            self.price = min(self.price, max(OVER * dual, 0.7 * self.price, LEAST_PRICE))
+        before, after = (one.values[1:].max(initial=0.0) for one in (state, step.state))
+        if after > max(5.0 * EXCESS, FALLS * before):  # it is worth more than it costs now
+            self.price *= 2.0
+        self.before = None if step.anew else (step, linear)
+        self.since += 1
+        self.state = step.state
+        self.passed.append(dict(step.state.outlines))
+        self._keep_met()
+
+    def _learn(self, state: State, keys: list[Place]) -> None:
+        """Find the derivatives of the stress at places."""
+        for key, row in zip(keys, self.problem.stress_slopes(state, keys), strict=True):
+            self.rows[key] = row, self.steps
+
+    def _curved(self, slopes: np.ndarray) -> None:
+        """Update the curvature of the Lagrangian by the step before."""
+        if len(self.H) != slopes.shape[1]:
+            self.H, self.before = np.zeros((slopes.shape[1],) * 2), None
+        if self.before is None:
+            return
+        step, old = self.before
+        change = slopes - old.slopes
+        y = change[0] + step.multipliers @ change[1:]
+        for key, price in step.places.items():
+            if key in self.rows and self.rows[key][1] == self.steps and key in old.hot:
+                y = y + price * (self.rows[key][0] - old.hot[key])
+        self.H = damped(self.H, step.whole, y)
+
+    def _linear(self, state: State, slopes: np.ndarray) -> Linear:
+        """Return the limits that a step of this radius can meet."""
+        reach, far, A, b, first = self.radius * FAR, [], [], [], 0
+        for one in sides_of(state).values():
+            g, own = one.rows()
+            near = g > -reach * one.cell * np.abs(own).sum(axis=1) - 0.1 * one.cell
+            wide = np.zeros((int(near.sum()), slopes.shape[1]))
+            wide[:, first : first + one.count] = own[near]
+            A.append(wide / one.cell)
+            b.append(np.maximum(-g[near] / one.cell, 0.0))
+            # Corners that hardly turn go far where their sides do not.
+            ends = one.ends_by_x() / one.cell
+            ends = ends[np.abs(ends).sum(axis=1) * one.cell > ENDS]
+            wide = np.zeros((2 * len(ends), slopes.shape[1]))
+            wide[:, first : first + one.count] = np.vstack([ends, -ends])
+            first += one.count
+            A.append(wide)
+            b.append(np.full(len(wide), ENDS * reach))
+            far.append(np.full(one.count, reach * one.cell))
+        hot = {key: row for key, (row, _) in self.rows.items()}
+        return Linear(slopes, hot, np.vstack(A), np.concatenate(b), np.concatenate(far))
+
+    def _tried(self, state: State, linear: Linear) -> Step | None:
+        """Return the best of the trial steps of one radius; None: none makes parts."""
+        tries: list[Step] = []
+        seen: Step | None = None
+        for _ in range(ATTEMPTS):
+            step = self._trial(state, linear, seen)
+            if step is None:
+                break
+            tries.append(step)
+            if step.fall >= 0.3 * step.promised or seen is not None:
+                break
+            after, places = step.state.places, state.places
+            worst = max((float(bent(np.array(v))) for v in after.values()), default=0.0)
+            unknown = [
+                key
+                for key in sorted(after, key=lambda k: -after[k])
+                if key in places
+                and (key not in linear.hot or self.rows[key][1] < self.steps)
+                and bent(np.array(after[key])) > max(EXCESS, 0.4 * worst)
+            ]
+            if unknown:
+                self._learn(state, unknown[:MOST])
+                hot = {key: row for key, (row, _) in self.rows.items()}
+                linear = replace(linear, hot=hot)
+            else:
+                seen = step
+        return max(tries, key=lambda one: one.fall, default=None)
+
+    def _trial(self, state: State, linear: Linear, seen: Step | None) -> Step | None:
+        x, promised, multipliers, places = self._programme(state, linear, seen)
+        found = self._led_to(state, x)
+        if found is None:
+            return None
+        after, whole, anew = found
+        fall = self._merit(state, state) - self._merit(after, state)
+        return Step(x, promised, multipliers, places, after, whole, anew, fall)
+
+    def _merit(self, one: State, held: State) -> float:
+        v, price = one.against(held.held), self.price * abs(held.values[0])
+        worst = max(one.places.values(), default=-1.0)
+        missed = np.maximum(bent(np.append(v[1:], worst)), 0.0).sum()
+        return float(v[0] + price * missed)
+
+    def _programme(
+        self, state: State, linear: Linear, seen: Step | None
+    ) -> tuple[np.ndarray, float, np.ndarray, dict[Place, float]]:
+        """Return a step, the fall of the merit that it promises, and all multipliers.
+
+        With a step that was seen, limits pass through what they were after it.
+        """
+        keys, base, far = list(linear.hot), state.against(state.held), linear.far
+        m, places = len(base) - 1, state.places
+        v = np.append(base[1:], [places[k] for k in keys])
+        F = np.vstack([linear.slopes[1:], *linear.hot.values()]) * bent_slope(v)[:, None] * far
+        f = bent(v)
+        if seen is not None:
+            own, other = seen.state.against(state.held), seen.state.places
+            after = np.append(own[1:], [other.get(k, places[k]) for k in keys])
+            f = bent(after) - F @ (seen.whole / far)
+        price = self.price * abs(base[0])
+        slack = np.append(np.arange(m), np.full(len(keys), m)).astype(int)
+        H = far[:, None] * self.H * far + 1e-6 * abs(base[0]) * np.eye(len(far))
+        g = linear.slopes[0] * far
+        x, dual = solve(H, g, F, f, np.full(m + 1, price), slack, linear.A * far, linear.b)
+
+        def missed(values: np.ndarray) -> float:
+            return float(np.maximum(values[:m], 0.0).sum() + values[m:].max(initial=0.0))
+
+        promised = -g @ x - 0.5 * x @ H @ x + price * (missed(f) - missed(f + F @ x))
+        dual = dual * bent_slope(v)
+        return x * far, float(promised), dual[:m], dict(zip(keys, dual[m:], strict=True))
+
+    def _led_to(self, state: State, x: np.ndarray) -> tuple[State, np.ndarray, bool] | None:
+        """Return the state after a step, the whole step, and whether its meshes are new."""
+        first, after, whole = 0, dict[int, FreeSides](), []
+        try:
+            for k, one in sides_of(state).items():
+                part = x[first : first + one.count]
+                first += one.count
+                near = one.moved(part).nearest()
+                if near is None:
+                    return None
+                after[k] = near[0]
+                whole.append(part + near[1])
+            every = self.problem.every(after)
+            bodies = {k: one.followed(state.bodies[k]) for k, one in every.items()}
+            followed = {k: body for k, body in bodies.items() if body is not None}
+            anew = len(followed) < len(bodies)
+            found = self.problem.evaluated(after, {} if anew else followed, state.solutions)
+        except (BrokenError, ConvergenceError, InputError):
+            return None
+        return found, np.concatenate(whole), anew
