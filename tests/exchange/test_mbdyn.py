@@ -267,7 +267,7 @@ def test_export_writes_every_arm(shared_tmp_path):
 
 @pytest.mark.parametrize(
     ("stiffening", "duration", "on"),
-    [("true", 1.9, True), ("false", 0.9, False), ("auto", 4.0, False), ("auto", 0.9, True)],
+    [("true", 1.9, True), ("false", 0.9, False), ("auto", 6.0, False), ("auto", 0.9, True)],
 )
 def test_export_with_geometric_stiffness(shared_tmp_path, stiffening, duration, on):
     """Where the scene says so, or its motion; a scene that takes the file's arm moves the same."""
