@@ -103,7 +103,8 @@ def _bore(name: str) -> Callable[[Tree, Row, Any], None]:
 
 def _exact(tree: Tree, row: Row, value: Any) -> None:
     if value:
-        for objective in rows(tree, "objective") or [tree.setdefault("objective", {})]:
+        tree.setdefault("objective", {})
+        for objective in rows(tree, "objective"):
             objective["gradient"] = "exact"
 
 
@@ -181,7 +182,8 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
             if not unset or (anew and word.translate is not None):
                 told.append(f"{word.old} is read as {word.new}")
     for row in rows(tree, "objective"):
-        if (kind := row.get("kind")) in OLD_KINDS:
+        kind = row.get("kind")
+        if isinstance(kind, str) and kind in OLD_KINDS:
             row["kind"] = OLD_KINDS[kind]
             told.append(f'objective.kind = "{kind}" is read as "{OLD_KINDS[kind]}"')
     return list(dict.fromkeys(told))

@@ -240,6 +240,8 @@ LIKELY = st.floats(0, 1) | st.integers(1, 9) | st.lists(st.integers(1, 9), min_s
 @given(st.dictionaries(st.sampled_from(PATHS), LIKELY | VALUES, min_size=1, max_size=4))
 @example({"arms.0.cells": [100_000, 1], "arms.0.passive": 1e-320})
 @example({"arms.0.length": 5e-324})
+@example({"objective.kind": [1, 1]})
+@example({"optimizer.exact_iterations": 5, "objective": 1})
 def test_any_value_is_accepted_or_refused(changes):
     data = minimal()
     for path, value in changes.items():
