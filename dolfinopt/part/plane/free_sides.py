@@ -236,7 +236,6 @@ class FreeSides:
         return {
             "sides": np.array(rows), "corners": np.array(corners), "sizes": np.array(sizes),
             "circles": np.array(circles).reshape(-1, 5),
-            "pairs": np.array(self.sides.pairs).reshape(-1, 2),
         }  # fmt: skip
 
     def restored(self, arrays: Mapping[str, np.ndarray]) -> FreeSides:
@@ -254,8 +253,7 @@ class FreeSides:
         circles = [
             Circle(row[:2], float(row[2]), int(row[3]), int(row[4])) for row in arrays["circles"]
         ]
-        pairs = tuple((int(a), int(b)) for a, b in arrays["pairs"])
-        made = replace(self.sides, loops=tuple(loops), circles=tuple(circles), pairs=pairs)
+        made = replace(self.sides, loops=tuple(loops), circles=tuple(circles))
         return replace(self, sides=made.centred())
 
 

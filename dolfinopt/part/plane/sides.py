@@ -286,14 +286,12 @@ class Sides:
         loops: of sides, the outer one first.
         circles: round holes that move.
         fixed: loops of the arm's own curves: bores.
-        pairs: keys of sides that stay parallel.
         holds_radii: whether radii stay as they are.
     """
 
     loops: Loops
     circles: tuple[Circle, ...] = ()
     fixed: tuple[tuple[Piece, ...], ...] = ()
-    pairs: tuple[tuple[int, int], ...] = ()
     holds_radii: bool = False
 
     @cached_property
@@ -430,7 +428,7 @@ class Sides:
             loops.append(Loop(tuple(sides), tuple(corners)))
         return replace(self, loops=tuple(loops))
 
-    # -- ties: mirror images, parallel sides -----------------------------------------------------
+    # -- ties: mirror images ---------------------------------------------------------------------
 
     @cached_property
     def ties(self) -> np.ndarray:
@@ -452,11 +450,9 @@ class Sides:
             if one.twin in rings:
                 j, twin = rings[one.key], rings[one.twin]
                 pairs += [(j, twin, 1.0), (j + 1, twin + 1, -1.0), (j + 2, twin + 2, 1.0)]
-        pairs += [(at[a] + 1, at[b] + 1, 1.0) for a, b in self.pairs if a in at and b in at]
-        # A line beside which the arm's own edge stays is held.
-        held = [at[a] + 1 for a, b in self.pairs if a in at and b not in at]
+        held: list[int] = []
         if self.holds_radii:
-            held += [*corners.values(), *range(self.of_circles + 2, count, 3)]
+            held = [*corners.values(), *range(self.of_circles + 2, count, 3)]
         T = _tied(count, pairs, held)
         half = np.ones(count)
         for key, j in sides.items():

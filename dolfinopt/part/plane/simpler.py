@@ -74,7 +74,7 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
         keys = {side.key for side in loop.sides} | {side.twin for side in loop.sides}
         if all(side.free for side in loop.sides) and abs(loop.area) < least:
             kept = [one for one in sides.loops if not {s.key for s in one.sides} & keys]
-            yield replace(sides, loops=tuple(kept), pairs=())
+            yield replace(sides, loops=tuple(kept))
     for ring in sides.circles:
         if np.pi * ring.radius**2 < least:
             left = [one for one in sides.circles if one.key not in (ring.key, ring.twin)]
@@ -194,7 +194,7 @@ def _without(
         if made is None:
             return
         loops.append(made)
-    yield replace(sides, loops=tuple(loops), pairs=())
+    yield replace(sides, loops=tuple(loops))
 
 
 def _merged(sides: Sides, a: Side, b: Side, limits: Limits, outer: int) -> Iterator[Sides]:
@@ -223,4 +223,4 @@ def _spliced(sides: Sides, a: int, b: int, limits: Limits, outer: int) -> Sides 
         return None
     loops = [loop for number, loop in enumerate(sides.loops) if number not in (i, j)]
     loops.insert(0 if i == 0 else len(loops), made)
-    return replace(sides, loops=tuple(loops), pairs=())
+    return replace(sides, loops=tuple(loops))
