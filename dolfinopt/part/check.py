@@ -24,11 +24,11 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.output.design import ArmView, gather_views
 from dolfinopt.output.trajectory import drive_units
+from dolfinopt.part.buckling import LeastBuckling, lowest_buckling
 from dolfinopt.part.folder import scene_data, toml_text
 from dolfinopt.part.part import Meshes, Part, PartMesh
 from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.buckling import LeastBuckling, lowest_buckling
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report, unjudged
 from dolfinopt.scene.load import Scene, scene_from_dict

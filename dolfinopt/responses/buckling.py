@@ -13,17 +13,15 @@ Source: Ferrari & Sigmund (2019), doi:10.1007/s00158-019-02253-3.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, partial
 
 import numpy as np
 from scipy.signal import find_peaks
 
-from dolfinopt.arms.arm import Arm
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.modes import BucklingModes, buckling_modes
 from dolfinopt.density.interpolation import interpolate
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.fem.stress import Prestress, PrestressGradient, StressedModulus
 from dolfinopt.parallel import on_all_ranks, on_root, together
 from dolfinopt.responses.measured import (
@@ -129,49 +127,6 @@ def _ritz(state: DesignState, a: np.ndarray, known: Sequence[BucklingModes]) -> 
 
     found: np.ndarray = on_root(arm.comm, largest)
     return found
-
-
-# -- the least factor of a machine ---------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class LeastBuckling:
-    """What buckles first.
-
-    Attributes:
-        factor: of the loads; infinite where nothing buckles below `LARGEST_FACTOR`.
-        place: of the arm in the chain.
-        instant: s.
-    """
-
-    factor: float
-    place: int
-    instant: float
-
-
-def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuckling | None:
-    """Return the lowest factor of all arms at their worst instants, on this rank alone.
-
-    None where nothing loads them.
-
-    Args:
-        arms: of solid material, reduced.
-        trajectory: of these arms; of scenarios the worst counts.
-    """
-    scene, motions = next(iter(arms.values())).scene, motions_of(trajectory)
-    found = []
-    for k, loads in arm_loads(scene, motions).items():
-        # All motions one after the other: what is worst along one tells of the others, too.
-        whole = np.concatenate([one.coefficients / one.stiffer for one in loads])
-        of, first = np.repeat(range(len(loads)), [len(one.instants) for one in loads]), loads[0]
-        every = replace(first, coefficients=whole, stiffer=1.0, instants=np.arange(len(whole)))
-        for each in pressed(arms[k].current, every):
-            one = loads[of[each.instant]]
-            own = each.instant - int(np.argmax(of == of[each.instant]))
-            mu, t = float(each.modes.inverse[0]), motions[one.motion].t[own]
-            factor = 1.0 / mu if mu * LARGEST_FACTOR > 1.0 else float("inf")
-            found.append(LeastBuckling(factor, one.place, float(t)))
-    return min(found, key=lambda one: one.factor, default=None)
 
 
 def _of_design(state: DesignState, loads: Sequence[ArmLoads]) -> list[Pressed]:

@@ -15,9 +15,9 @@ from dolfinopt.cli.shared import scene_of
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.output.design import canonical_order
 from dolfinopt.part import check as checks
+from dolfinopt.part.buckling import LeastBuckling
 from dolfinopt.part.check import check_parts, crisp
 from dolfinopt.part.part import make_parts, mesh_parts
-from dolfinopt.responses.buckling import LeastBuckling
 
 pytestmark = pytest.mark.serial
 

@@ -1,0 +1,56 @@
+"""The lowest factor on a machine's loads at which one of its parts buckles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dolfinopt.responses.buckling import LARGEST_FACTOR, arm_loads, pressed
+from dolfinopt.responses.motion import motions_of
+
+if TYPE_CHECKING:
+    from dolfinopt.arms.arm import Arm
+    from dolfinopt.dynamics.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class LeastBuckling:
+    """What buckles first.
+
+    Attributes:
+        factor: of the loads; infinite where nothing buckles below `LARGEST_FACTOR`.
+        place: of the arm in the chain.
+        instant: s.
+    """
+
+    factor: float
+    place: int
+    instant: float
+
+
+def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuckling | None:
+    """Return the lowest factor of all arms at their worst instants, on this rank alone.
+
+    None where nothing loads them.
+
+    Args:
+        arms: of solid material, reduced.
+        trajectory: of these arms; of scenarios the worst counts.
+    """
+    scene, motions = next(iter(arms.values())).scene, motions_of(trajectory)
+    found = []
+    for k, loads in arm_loads(scene, motions).items():
+        # All motions one after the other: what is worst along one tells of the others, too.
+        whole = np.concatenate([one.coefficients / one.stiffer for one in loads])
+        of, first = np.repeat(range(len(loads)), [len(one.instants) for one in loads]), loads[0]
+        every = replace(first, coefficients=whole, stiffer=1.0, instants=np.arange(len(whole)))
+        for each in pressed(arms[k].current, every):
+            one = loads[of[each.instant]]
+            own = each.instant - int(np.argmax(of == of[each.instant]))
+            mu, t = float(each.modes.inverse[0]), motions[one.motion].t[own]
+            factor = 1.0 / mu if mu * LARGEST_FACTOR > 1.0 else float("inf")
+            found.append(LeastBuckling(factor, one.place, float(t)))
+    return min(found, key=lambda one: one.factor, default=None)
