@@ -178,7 +178,7 @@ def compile_together(cell: forms.Cell) -> None:
 
 def places(points: np.ndarray) -> tuple[tuple[float, ...], ...]:
     """Return points (p, d) as what can be a key."""
-    return tuple(tuple(point) for point in points.tolist())
+    return tuple(tuple(map(float, point)) for point in points)
 
 
 def gauss_points(cell: forms.Cell, degree: int) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import accumulate
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,7 +34,7 @@ class Variables:
         sizes = {k: arm.mesh.num_cells for k, arm in self.arms.items()}
         before = comm.exscan(sum(sizes.values())) or 0  # of an arm that ranks share
         every = on_all_ranks(partition, {k: comm.allreduce(size) for k, size in sizes.items()})
-        ends = np.cumsum([0, *every.values()]).tolist()
+        ends = list(accumulate(every.values(), initial=0))
         first = {k: end + before for k, end in zip(every, ends, strict=False)}
         self.size: int = ends[-1]
         self._parts = {k: slice(first[k], first[k] + size) for k, size in sizes.items()}

@@ -152,8 +152,8 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     for bound in constraints_of(analysis.scene):
         found = bound.response.measure(analysis)
         limits = bound.smooth_limits(found)
-        constraints += (np.array(found.smooth) / limits - 1.0).tolist()
-        smooth_limits += limits.tolist()
+        constraints += map(float, np.array(found.smooth) / limits - 1.0)
+        smooth_limits += map(float, limits)
         measured.append(found)
     return Evaluation(
         **vars(replace(motion, objective=measured[0].total)),

@@ -376,7 +376,7 @@ def worst_of(
     if len(values) == 1:
         return values[0], [1.0]
     worst, by_values = p_norm(np.array(values), -exponent if least else exponent)
-    return worst, by_values.tolist()
+    return worst, list(map(float, by_values))
 
 
 def combined(
