@@ -31,8 +31,7 @@ from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm, build_arms
-    from dolfinopt.dynamics.simulation import simulate
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory, simulate
     from dolfinopt.errors import ConvergenceError, InputError
     from dolfinopt.loading import load_scene
     from dolfinopt.model import Model, OptimizationResult, SimulationResult
@@ -67,8 +66,8 @@ _HOME = {
     "Scene": "scene.load",
     "load_scene": "loading",
     "scene_from_dict": "scene.load",
-    "Trajectory": "dynamics.trajectory",
-    "simulate": "dynamics.simulation",
+    "Trajectory": "dynamics.build",
+    "simulate": "dynamics.build",
 }
 
 __all__ = [*sorted(_HOME), "__version__"]

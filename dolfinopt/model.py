@@ -210,7 +210,7 @@ class SimulationResult(Result):
         Raises:
             InputError: the instant is not within the motion.
         """
-        from dolfinopt.dynamics.state_space import state_space
+        from dolfinopt.dynamics.build import state_space
 
         return None if self.trajectory is None else state_space(self.trajectory, t)
 

@@ -29,7 +29,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.budget import check_budget
 from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
-from dolfinopt.motion.machine import rigid_link
+from dolfinopt.motion.build import rigid_link
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, on_root, sum_over_arms, together

@@ -20,7 +20,7 @@ from mpi4py import MPI
 from pydantic import ConfigDict, ValidationError, model_validator
 
 from dolfinopt.data import benchmark_folder
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.model import Model, SimulationResult
 from dolfinopt.multibody.kinematics import Posed

@@ -175,7 +175,7 @@ def _export_state_space(
             raise InputError("--design: expected none with the folder of a run, which has its own")
         design, folder = source / "design.npz", out or source / "state-space"
     world, loaded = _machine(source, overrides)
-    from dolfinopt.dynamics.state_space import check_instant
+    from dolfinopt.dynamics.build import check_instant
     from dolfinopt.output.design import arms_with_design
     from dolfinopt.parallel import together
     from dolfinopt.profiling import Profile

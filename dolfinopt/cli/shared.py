@@ -44,7 +44,7 @@ from dolfinopt.output.folders import (
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.optimization.state import HistoryRow
     from dolfinopt.output.design import ArmView
     from dolfinopt.responses.order_selection import OrderSelection

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.trajectory import MachineTrajectory
 from dolfinopt.multibody.kinematics import end_effector_gradient
 
 # Kinds of parts, and the words for all of a kind.
@@ -62,7 +62,7 @@ class Budget:
         return found
 
 
-def deflection_budget(trajectory: Trajectory) -> Budget | None:
+def deflection_budget(trajectory: MachineTrajectory) -> Budget | None:
     """Return the budget of a motion at the instant of the largest deviation; None without one.
 
     With n the direction of the deviation and J the Jacobian of the end-effector in the desired
@@ -75,7 +75,7 @@ def deflection_budget(trajectory: Trajectory) -> Budget | None:
     """
     worst = int(np.argmax(trajectory.distance))
     size = float(trajectory.distance[worst])
-    if size == 0.0 or trajectory.scene.is_pinned:
+    if size == 0.0 or trajectory.is_pinned:
         return None
     seen = trajectory.at(trajectory.t[worst : worst + 1])
     by_rigid, by_q = _derivatives(seen, seen.deviation / size)
@@ -89,7 +89,7 @@ def deflection_budget(trajectory: Trajectory) -> Budget | None:
     return Budget(float(seen.t[0]), size, linear, parts)
 
 
-def _derivatives(seen: Trajectory, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _derivatives(seen: MachineTrajectory, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return those of the end-effector's place along a direction (1, d): (R,), (N,)."""
     mechanism, problem, desired = seen.mechanism, seen.problem, seen.desired
     none = np.zeros((1, mechanism.num_coordinates))
@@ -101,33 +101,33 @@ def _derivatives(seen: Trajectory, direction: np.ndarray) -> tuple[np.ndarray, n
     return every[0, : mechanism.num_rigid], every[0, mechanism.num_rigid :]
 
 
-def _elastic(seen: Trajectory, by_q: np.ndarray) -> Iterator[tuple[str, str, float]]:
+def _elastic(seen: MachineTrajectory, by_q: np.ndarray) -> Iterator[tuple[str, str, float]]:
     """Yield what links and bearings contribute."""
-    mechanism, joints, q = seen.mechanism, seen.scene.joint_names, seen.q_e[0]
-    names = [("link", arm.name) for arm in seen.scene.arms]
-    names += [("bearing", joints[k]) for k in mechanism.bearings]
+    mechanism, called, q = seen.mechanism, seen.problem.names, seen.q_e[0]
+    names = [("link", arm) for arm in called.arms]
+    names += [("bearing", called.joints[k]) for k in mechanism.bearings]
     for (kind, name), part in zip(names, mechanism.slices, strict=True):
         if part.stop > part.start:
             yield kind, name, float(by_q[part] @ q[part])
 
 
-def _rigid(seen: Trajectory, by_rigid: np.ndarray) -> Iterator[tuple[str, str, float]]:
+def _rigid(seen: MachineTrajectory, by_rigid: np.ndarray) -> Iterator[tuple[str, str, float]]:
     """Yield what gears, rods and errors of the control contribute."""
-    problem, scene, names = seen.problem, seen.scene, list(seen.scene.rigid_units)
+    problem, mechanism = seen.problem, seen.mechanism
+    controlled, names = problem.drives.controlled, list(problem.names.units)
     error, gives_way = (seen.q_r - seen.desired.q)[0], _gives_way(seen)
-    rods = {one.name for one in scene.rods}
     for k in map(int, problem.drives.free[problem.drives.driven]):
-        if scene.control is None or k in problem.motor_joints:
-            kind = "rod" if names[k] in rods else "gear"
+        if not controlled or k in problem.motor_joints:
+            kind = "rod" if k >= mechanism.num_rigid - mechanism.rods else "gear"
             yield kind, names[k], float(by_rigid[k] * gives_way[k])
-        if scene.control is not None:
+        if controlled:
             yield "control", names[k], float(by_rigid[k] * (error[k] - gives_way[k]))
 
 
-def _gives_way(seen: Trajectory) -> np.ndarray:
+def _gives_way(seen: MachineTrajectory) -> np.ndarray:
     """Return by how much every gear and rod gives way (R,), rad or m."""
     problem, columns = seen.problem, seen.problem.motor_joints
-    if seen.scene.control is None:  # motors are where they are asked to be
+    if not problem.drives.controlled:  # motors are where they are asked to be
         return np.asarray((seen.q_r - seen.desired.q)[0])
     found = np.zeros(seen.q_r.shape[1])
     if seen.motors is not None:

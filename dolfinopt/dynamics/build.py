@@ -1,37 +1,59 @@
-"""Scene + floating bodies -> mechanism, and the system of equations that moves it."""
+"""Scene + floating bodies -> the system of equations that moves them, and the simulated motion.
+
+The one file of the room that reads the scene.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.dynamics import radau
+from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.drives import Drives, Springs
-from dolfinopt.dynamics.machine_system import MachineSystem
+from dolfinopt.dynamics.feed_forward import (
+    FeedForward,
+    corrected,
+    feed_forward_of,
+    with_known_forces,
+)
+from dolfinopt.dynamics.linearised import Linearised, linearised
+from dolfinopt.dynamics.machine_system import MachineSystem, Names
 from dolfinopt.dynamics.measured import FILE_ROUNDING, KEPT_INSTANTS_LIMIT
-from dolfinopt.dynamics.tables import LoadedMotion, Table
-from dolfinopt.errors import InputError
+from dolfinopt.dynamics.response_instants import response_instants
+from dolfinopt.dynamics.state_space import StateSpace, freed_rates, linear_model
+from dolfinopt.dynamics.tables import LoadedMotion, Table, read_forces
+from dolfinopt.dynamics.trajectory import MachineTrajectory
+from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.motion.build import (
     breakpoints,
+    build_mechanism,
     check_path,
+    friction_of,
+    loops_of,
     passive_coordinates,
     rests,
     rigid_motion,
+    soft_joints,
     table_rows,
 )
-from dolfinopt.motion.machine import build_mechanism, friction_of, loops_of, soft_joints
 from dolfinopt.motion.measured import DENSE_INSTANTS
 from dolfinopt.multibody.loads import largest_change
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tree import AppliedForce
-from dolfinopt.scene.csv_table import TIME, read_table
-from dolfinopt.scene.duration import file_stamp, stamp
+from dolfinopt.profiling import Profile
+from dolfinopt.scene.duration import file_stamp
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import place_of
-from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Force
+from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Control, Force
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 
 def is_machine(scene: Scene) -> bool:
@@ -94,13 +116,20 @@ def build_system(scene: Scene, bodies: list[ShapeIntegrals]) -> MachineSystem:
         motion = LoadedMotion(motion, loads, rows)
         instants = with_ends(instants, loads, scene.horizon)
     if not is_machine(scene):
-        return MachineSystem(mechanism, motion, instants)
+        return MachineSystem(mechanism, motion, instants, names=names_of(scene))
     drives = _drives(scene)
     if drives.table is not None:
         instants = with_ends(instants, [drives.table], scene.horizon)
     if drives.rigid_feed_forward:
         instants = _among(instants, _reversals(scene, motion), scene.horizon)
-    return MachineSystem(mechanism, motion, instants, drives, loops_of(scene))
+    loops, names = loops_of(scene), names_of(scene)
+    return MachineSystem(mechanism, motion, instants, drives, loops, names=names)
+
+
+def names_of(scene: Scene) -> Names:
+    """Return what the parts of a scene's machine are called."""
+    arms = tuple(arm.name for arm in scene.arms)
+    return Names(scene.source, arms, scene.joint_names, scene.rigid_units, scene.driven)
 
 
 def _reversals(scene: Scene, motion: Callable[[np.ndarray], RigidMotion]) -> list[float]:
@@ -180,6 +209,7 @@ def _drives(scene: Scene) -> Drives:
         damping=damping[rows],
         limits=limits[rows],
         driven=~dependent[rows],
+        controlled=control is not None,
         rigid_feed_forward=control is not None and control.feed_forward in ("rigid", "elastic"),
         winding=control is not None and control.feed_forward == "elastic",
         table=None if table is None else Table(table.t, table.values[:, rows]),
@@ -192,7 +222,7 @@ def _table_of_forces(scene: Scene) -> Table | None:
     """Return the scene's table of forces of all rigid coordinates, or None."""
     if scene.control is None or scene.control.forces is None:
         return None
-    table = _table(scene.control.forces, scene.driven)
+    table = read_forces(scene.control.forces, scene.driven)
     values = np.zeros((len(table.t), scene.num_rigid))
     values[:, np.arange(scene.num_rigid)[scene.driven_columns]] = table.values
     return Table(table.t + scene.lead, values)
@@ -247,19 +277,161 @@ def _load(force: Force, dimension: int, lead: float) -> Table:
     constant = np.array([*force.force_in(dimension), *force.moment_in(dimension)])
     table = Table(np.zeros(1), np.zeros((1, len(constant))))
     if force.table is not None:
-        table = _table(force.table, FORCE_COLUMNS[dimension])
+        table = read_forces(force.table, FORCE_COLUMNS[dimension])
     return Table(table.t + lead, force.factor * table.values, force.factor * constant)
 
 
-def _table(file: str, columns: tuple[str, ...]) -> Table:
-    """Return a table of forces, and the instants of its rows."""
-    return _read_forces(file, columns, stamp(file))
+# -- simulation ----------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=16)
-def _read_forces(file: str, columns: tuple[str, ...], written: int) -> Table:
-    """Return what `_table` does; `written` tells versions of the file apart."""
-    table = read_table(file, columns)
-    if table.t is None:
-        raise InputError(f"{file}: expected a column {TIME} besides {', '.join(columns)}")
-    return Table(table.t, table.rows)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Trajectory(MachineTrajectory):
+    """A simulated motion of a scene's machine.
+
+    Attributes:
+        scene: what was simulated.
+    """
+
+    scene: Scene
+
+    @cached_property
+    def sampled(self) -> Self:
+        """The same motion every `simulation.sample`, as files have it."""
+        horizon, sample = self.scene.horizon, self.scene.simulation.sample
+        t = np.arange(round(horizon / sample) + 1) * sample
+        t = t[t <= horizon * (1 + 1e-12)]
+        return self if np.array_equal(t, self.t) else self.at(t)
+
+    @property
+    def settling(self) -> float:
+        """Largest deviation in any rest: after the motion and in its dwells, see `rests`, m.
+
+        With a horizon that ends with the motion, the deviation at its end.
+        """
+        return float(self.distance[self.at_rest].max())
+
+    @property
+    def at_rest(self) -> np.ndarray:
+        """Which instants are in a rest (n,); the last one is in any case."""
+        rounding, t = 1e-9 * self.scene.horizon, self.t - self.scene.lead
+        found = np.zeros(len(t), dtype=bool)
+        for begin, end in rests(self.scene):
+            found |= (t >= begin - rounding) & (t <= end + rounding)
+        found[-1] = True
+        return found
+
+
+def simulate(
+    scene: Scene,
+    bodies: list[ShapeIntegrals],
+    profile: Profile,
+    start: Solution | None = None,
+    feed_forward: FeedForward | None = None,
+) -> Trajectory:
+    """Integrate the elastic coordinates over the horizon to `simulation.tolerance`.
+
+    Args:
+        scene: motion, payload, control, tolerance.
+        bodies: from the cart outwards.
+        profile: counts the simulation.
+        start: solution of a nearby design, or None.
+        feed_forward: of another machine, whose corrections this one moves with; None: its own.
+
+    Raises:
+        ConvergenceError: the integrator gave up, or an arm bends by more than `DEFLECTION_LIMIT`
+            of its length; the message says what to try.
+    """
+    problem, options = build_system(scene, bodies), scene.simulation
+    with profile.phase("simulation"):
+        own = scene.feed_forward.on and feed_forward is None
+        if own:
+            plain = build_system(scene.unchecked_copy({"control": None}), bodies)
+            path = scene.lead, scene.lead + scene.motion.duration
+            asked = scene.feed_forward
+            feed_forward = feed_forward_of(plain, asked, path, options, profile, start)
+        if feed_forward is not None:
+            problem = corrected(problem, feed_forward.corrections)
+            if scene.control is not None:
+                problem = with_known_forces(problem, feed_forward)
+        if own and feed_forward is not None and scene.control is None:
+            problem, solution = feed_forward.machine, feed_forward.solution
+        else:
+            solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
+    profile.counts.simulations += 1
+    t = response_instants(
+        solution,
+        problem.mechanism.stiffness(),
+        problem.elastic_columns,
+        scene.lead,
+        scene.horizon,
+        scene.objective.load_cases,
+    )
+    trajectory = Trajectory(
+        problem=problem, solution=solution, t=t, feed_forward=feed_forward, scene=scene
+    )
+    trajectory.check_deflections()
+    return trajectory
+
+
+def simulate_all(
+    scenes: Sequence[Scene],
+    bodies: Sequence[list[ShapeIntegrals]],
+    profile: Profile,
+    starts: Sequence[Solution | None] = (),
+) -> list[Trajectory | ConvergenceError]:
+    """Integrate several scenes, each to its `simulation.tolerance`.
+
+    Args:
+        scenes: any number of them.
+        bodies: of each, from the cart outwards.
+        profile: counts the simulations.
+        starts: solution of a nearby design for each, or None.
+
+    Returns:
+        In the scenes' order; of one that fails, or bends by more than `DEFLECTION_LIMIT` of an
+        arm's length, its error, see `simulate`.
+    """
+    starts = [*starts, *[None] * (len(scenes) - len(starts))]
+    results: list[Trajectory | ConvergenceError] = []
+    for scene, own, start in zip(scenes, bodies, starts, strict=True):
+        try:
+            results.append(simulate(scene, own, profile, start))
+        except ConvergenceError as error:
+            results.append(error)
+    return results
+
+
+# -- linearised about the motion -----------------------------------------------------------------
+
+
+def check_instant(scene: Scene, t: float) -> None:
+    """Raise `InputError` when an instant, s, is not within the motion."""
+    if not 0.0 <= t <= scene.motion.horizon:
+        raise InputError(
+            f"--state-space {t:g}: expected an instant from 0 to motion.horizon = "
+            f"{scene.motion.horizon:g} [s]"
+        )
+
+
+def free_machine(trajectory: Trajectory, t: float) -> Linearised:
+    """Return the machine linearised at an instant t, s, all drives free where none controls it."""
+    scene, known = trajectory.scene, trajectory.problem
+    rates = trajectory.at(np.array([t])).unknowns
+    if scene.control is not None:
+        return linearised(known, t, rates)
+    # Drives on all driven coordinates, whose forces nothing asks for.
+    none = (0.0,) * len(scene.driven)
+    control = Control(feed_forward="none", stiffness=none, damping=none)
+    bodies = list(known.mechanism.arms)  # bearings follow from the scene
+    system = build_system(scene.unchecked_copy({"control": control}), bodies)
+    return linearised(system, t, freed_rates(system, known, rates))
+
+
+def state_space(trajectory: Trajectory, t: float) -> StateSpace:
+    """Return a simulated machine linearised at an instant t of its motion, s, see `linear_model`.
+
+    Raises:
+        InputError: the instant is not within the motion, or a coordinate has no mass.
+    """
+    check_instant(trajectory.scene, t)
+    return linear_model(free_machine(trajectory, t), trajectory.scene.control is not None)

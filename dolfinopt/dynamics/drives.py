@@ -65,6 +65,7 @@ class Drives:
         stiffness, damping: Kp, Kd (R,); N/m and N s/m, N m/rad and N m s/rad.
         limits: (R,) N, N m; inf without.
         driven: (R,) True where a drive acts; others follow from a closed loop.
+        controlled: whether a control acts; without it joints with springs alone are driven.
         rigid_feed_forward: whether u_ff is inverse dynamics of the machine with rigid arms.
         winding: whether motors behind springs are asked to turn ahead of their joints by what the
             springs give under u_ff.
@@ -78,6 +79,7 @@ class Drives:
     damping: np.ndarray
     limits: np.ndarray
     driven: np.ndarray
+    controlled: bool = False
     rigid_feed_forward: bool = False
     table: Any = None
     springs: Springs = NO_SPRINGS

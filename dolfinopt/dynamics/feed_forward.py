@@ -15,7 +15,7 @@ doi:10.1007/s11044-012-9318-6.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import combinations, pairwise
@@ -59,7 +59,8 @@ from dolfinopt.multibody.kinematics import end_effector, end_effector_gradient, 
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.profiling import Profile
-from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.feed_forward import FeedForward as Asked
+from dolfinopt.scene.tables.motion import Simulation
 
 # -- corrections -----------------------------------------------------------------------------
 
@@ -522,20 +523,32 @@ def at_rest(machine: MachineSystem, tolerance: float, stages: int) -> Solution:
 
 
 def feed_forward_of(
-    machine: MachineSystem, scene: Scene, profile: Profile, start: Solution | None = None
+    machine: MachineSystem,
+    asked: Asked,
+    path: tuple[float, float],
+    options: Simulation,
+    profile: Profile,
+    start: Solution | None = None,
 ) -> FeedForward:
-    """Return the corrections of a scene's machine.
+    """Return the corrections of a machine.
 
-    The knots are as close as it takes to leave `LEFT_AIM` of the deviation, or as the scene has
-    them.
+    The knots are as close as it takes to leave `LEFT_AIM` of the deviation, or as they are asked
+    for.
+
+    Args:
+        machine: without corrections.
+        asked: joints and spacing, or None for either.
+        path: its beginning and end, s.
+        options: tolerance and stages.
+        profile: counts Newton iterations.
+        start: solution of a nearby design, or None.
 
     Raises:
         ConvergenceError: a motion with corrections cannot be simulated.
         InputError: at some instant no joints move the tip along its path.
     """
-    joints, regularity, redundant = joints_of(machine, scene)
-    options, asked = scene.simulation, scene.feed_forward.spacing
-    spacing = asked or FIRST_SPACING * scene.motion.duration
+    joints, regularity, redundant = joints_of(machine, asked.joints, path[0])
+    spacing = asked.spacing or FIRST_SPACING * (path[1] - path[0])
     run = partial(
         radau.integrate, tolerance=options.tolerance, stages=options.stages, profile=profile
     )
@@ -554,7 +567,7 @@ def feed_forward_of(
             moved = corrected(machine, corrections)
             solution = guess = run(moved, guess=guess)
         left = float(lengths(off_path(moved, solution, squares.t)).max())
-        if asked or left <= LEFT_AIM * before or left > 0.5 * last:
+        if asked.spacing or left <= LEFT_AIM * before or left > 0.5 * last:
             break
         spacing, last = 0.5 * spacing, left
     curved = redundant or left > CURVED_SHARE * before
@@ -571,14 +584,21 @@ def tip_error_at_rest(machine: MachineSystem, solution: Solution) -> float:
     return float(lengths(off_path(machine, solution, t) + answer.forced).max())
 
 
-def joints_of(machine: MachineSystem, scene: Scene) -> tuple[np.ndarray, float, bool]:
+def joints_of(
+    machine: MachineSystem, asked: Sequence[str] | None, begin: float
+) -> tuple[np.ndarray, float, bool]:
     """Return the rigid coordinates that are corrected, how well they move the tip, and a surplus.
+
+    Args:
+        machine: without corrections.
+        asked: names of the coordinates; None: those that move the tip best.
+        begin: of the path, s.
 
     Raises:
         InputError: they do not move it along every component of its path.
     """
-    names, asked = list(scene.rigid_units), scene.feed_forward.joints
-    every = np.sort([names.index(name) for name in scene.driven])
+    names = list(machine.names.units)
+    every = np.sort([names.index(name) for name in machine.names.driven])
     J, t = tip_by_joints(machine)
     needed = min(int(np.linalg.matrix_rank(J[:, :, every]).max()), len(every))
     if asked is None:
@@ -587,16 +607,16 @@ def joints_of(machine: MachineSystem, scene: Scene) -> tuple[np.ndarray, float, 
         joints = tuple(sorted(names.index(name) for name in asked))
     if len(joints) < needed:
         raise InputError(
-            f"{scene.source}: feed_forward.joints: expected at least {needed} joints, as many as "
-            "the tip has directions"
+            f"{machine.names.source}: feed_forward.joints: expected at least {needed} joints, as "
+            "many as the tip has directions"
         )
     values = least(J, joints, needed)
     worst = int(values.argmin())
     if values[worst] < SINGULAR_TIP:
         moved = ", ".join(names[k] for k in joints)
         raise InputError(
-            f"{scene.source}: feed_forward.joints: {moved} cannot move the tip along its path at "
-            f"t = {t[worst] - scene.lead:.4g} s; choose other joints, or a path that keeps away "
+            f"{machine.names.source}: feed_forward.joints: {moved} cannot move the tip along its "
+            f"path at t = {t[worst] - begin:.4g} s; choose other joints, or a path that keeps away "
             "from that position"
         )
     return np.array(joints), float(values[worst]), len(joints) > needed

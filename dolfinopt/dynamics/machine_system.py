@@ -19,8 +19,8 @@ multipliers s - 1. Source: Hairer, Lubich & Roche (1989), doi:10.1007/BFb0093947
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -45,6 +45,25 @@ from dolfinopt.multibody.tree import Friction, Mechanism
 PRESCRIBED = Drives(NO_COORDINATES, NOTHING, NOTHING, NOTHING, NO_COORDINATES > 0)
 
 
+@dataclass(frozen=True)
+class Names:
+    """What the parts of a machine are called, for messages, tables and files.
+
+    Attributes:
+        source: the file that describes it.
+        arms: from the base outwards.
+        joints: the inboard one of every arm.
+        units: "m" or "rad" of every rigid coordinate, by its name.
+        driven: rigid coordinates with a drive.
+    """
+
+    source: str = ""
+    arms: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
+    driven: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class MachineSystem:
     """See the module.
@@ -58,6 +77,7 @@ class MachineSystem:
         loops: closures, m equations; or None.
         path: motion along which rigid arms carry the end-effector, from which it deviates; None:
             the desired one.
+        names: of its parts.
     """
 
     mechanism: Mechanism
@@ -66,6 +86,7 @@ class MachineSystem:
     drives: Drives = PRESCRIBED
     loops: Loops | None = None
     path: Callable[[np.ndarray], RigidMotion] | None = None
+    names: Names = Names()
 
     # -- unknowns ----------------------------------------------------------------------------
 

@@ -9,17 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dolfinopt.dynamics.build import build_system
-from dolfinopt.dynamics.linearised import Linearised, linearised
+from dolfinopt.dynamics.linearised import Linearised
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.poles import damping_ratios
-from dolfinopt.dynamics.trajectory import Trajectory
-from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import Posed, SiteMotion
 from dolfinopt.multibody.shape_integrals import Rates
-from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.machine import Control
 
+OUTPUTS = ("tool", "deflection")
 WRENCH = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 
 
@@ -66,94 +62,60 @@ class StateSpace:
         }
 
 
-def check_instant(scene: Scene, t: float) -> None:
-    """Raise `InputError` when an instant, s, is not within the motion."""
-    if not 0.0 <= t <= scene.motion.horizon:
-        raise InputError(
-            f"--state-space {t:g}: expected an instant from 0 to motion.horizon = "
-            f"{scene.motion.horizon:g} [s]"
-        )
+def linear_model(one: Linearised, closed: bool) -> StateSpace:
+    """Return a linearised machine with all drives free as A, B, C, D.
 
-
-def free_machine(scene: Scene, known: MachineSystem, t: float, rates: Rates) -> Linearised:
-    """Return a scene's machine at an instant t, s, all its drives free where none controls it.
-
-    `rates` (1, S) are unknowns of the scene's system, `known`, and their derivatives.
+    Inputs are the drives' forces, in a closed loop those that are added to the control's, and force
+    and moment on the end-effector in the world's directions. Outputs are the drives' coordinates,
+    of joints behind springs the motors'; the end-effector's displacement; and the part of it that
+    the arms' deformation makes, the rigid coordinates held. `closed`: whether the control acts.
     """
-    if scene.control is not None:
-        return linearised(known, t, rates)
-    bodies = list(known.mechanism.arms)  # bearings follow from the scene
-    # Drives on all driven coordinates, whose forces nothing asks for.
-    none = (0.0,) * len(scene.driven)
-    control = Control(feed_forward="none", stiffness=none, damping=none)
-    system = build_system(scene.unchecked_copy({"control": control}), bodies)
-    # Drives that nothing controls are where the motion has them; so are motors before springs.
+    system, N = one.system, one.directions[0]
+    d, names = system.mechanism.dim.d, system.names
+    driven = system.drive_columns[system.drives.driven]
+    drives, wrench = np.eye(system.num_coordinates)[:, driven], _wrench(one)
+    b = N.T @ np.hstack([drives, wrench])
+    place = wrench[:, :d].T
+    bent = np.zeros_like(place)
+    bent[:, system.elastic_columns] = place[:, system.elastic_columns]
+    outputs = np.vstack([drives.T, place, bent]) @ N
+    every = coordinate_names(system)
+    kept = [every[k] for k in one.independent]
+    units = [names.units[name] for name in names.driven]
+    wrench_units = [*["N"] * d, *["N m"] * (wrench.shape[1] - d)]
+    return StateSpace(
+        time=float(one.t[0]),
+        A=one.A,
+        B=np.vstack([np.zeros_like(b), one.accelerations(b)]),
+        C=np.hstack([outputs, np.zeros_like(outputs)]),
+        D=np.zeros((len(outputs), b.shape[1])),
+        states=(*kept, *(f"{name} rate" for name in kept)),
+        inputs=(*names.driven, *(f"tool {name}" for name in WRENCH[d])),
+        outputs=(*names.driven, *(f"{what} {a}" for what in OUTPUTS for a in "xyz"[:d])),
+        input_units=(*("N" if unit == "m" else "N m" for unit in units), *wrench_units),
+        output_units=(*units, *["m"] * (2 * d)),
+        closed=closed,
+    )
+
+
+def freed_rates(system: MachineSystem, known: MachineSystem, rates: Rates) -> Rates:
+    """Return the unknowns of a machine with free drives that moves as `known` does.
+
+    Drives that nothing controls are where the motion has them; so are motors before springs.
+    """
     every = np.zeros((3, 1, system.num_coordinates))
     free = np.searchsorted(system.drives.free, known.drives.free)
     for new, old in zip(every, rates, strict=True):
         new[:, free] = old[:, : len(free)]
         new[:, system.elastic_columns] = old[:, known.elastic_columns]
         new[:, system.constraint_columns] = old[:, known.constraint_columns]
-    return linearised(system, t, (every[0], every[1], every[2]))
+    return every[0], every[1], every[2]
 
 
-def state_space(trajectory: Trajectory, t: float) -> StateSpace:
-    """Return a simulated machine linearised at an instant of its motion.
-
-    Inputs are the drives' forces, in a closed loop those that are added to the control's, and force
-    and moment on the end-effector in the world's directions. Outputs are the drives' coordinates,
-    of joints behind springs the motors'; the end-effector's displacement; and the part of it that
-    the arms' deformation makes, the rigid coordinates held.
-
-    Args:
-        trajectory: of a machine with or without control.
-        t: the instant, s.
-
-    Raises:
-        InputError: the instant is not within the motion, or a coordinate has no mass.
-    """
-    check_instant(trajectory.scene, t)
-    rates = trajectory.at(np.array([t])).unknowns
-    return linear_model(trajectory.scene, trajectory.problem, t, rates)
-
-
-def linear_model(scene: Scene, known: MachineSystem, t: float, rates: Rates) -> StateSpace:
-    """Return what `state_space` does, of the unknowns of a scene's system, see `free_machine`."""
-    one = free_machine(scene, known, t, rates)
-    system, N = one.system, one.directions[0]
-    driven = system.drive_columns[system.drives.driven]
-    drives, wrench = np.eye(system.num_coordinates)[:, driven], _wrench(one)
-    b = N.T @ np.hstack([drives, wrench])
-    place = wrench[:, : scene.dimension].T
-    bent = np.zeros_like(place)
-    bent[:, system.elastic_columns] = place[:, system.elastic_columns]
-    outputs = np.vstack([drives.T, place, bent]) @ N
-    names = coordinate_names(system, scene)
-    kept = [names[k] for k in one.independent]
-    free = scene.driven
-    units = [scene.rigid_units[name] for name in free]
-    axes = "xyz"[: scene.dimension]
-    wrench_units = [*["N"] * scene.dimension, *["N m"] * (wrench.shape[1] - scene.dimension)]
-    return StateSpace(
-        time=t,
-        A=one.A,
-        B=np.vstack([np.zeros_like(b), one.accelerations(b)]),
-        C=np.hstack([outputs, np.zeros_like(outputs)]),
-        D=np.zeros((len(outputs), b.shape[1])),
-        states=(*kept, *(f"{name} rate" for name in kept)),
-        inputs=(*free, *(f"tool {name}" for name in WRENCH[scene.dimension])),
-        outputs=(*free, *(f"tool {a}" for a in axes), *(f"deflection {a}" for a in axes)),
-        input_units=(*("N" if unit == "m" else "N m" for unit in units), *wrench_units),
-        output_units=(*units, *["m"] * (2 * scene.dimension)),
-        closed=scene.control is not None,
-    )
-
-
-def coordinate_names(system: MachineSystem, scene: Scene) -> list[str]:
+def coordinate_names(system: MachineSystem) -> list[str]:
     """Return the names of all unknowns of a machine."""
-    rigid = list(scene.rigid_units)
+    rigid, arms = list(system.names.units), system.names.arms
     names = [rigid[int(k)] for k in system.drives.free]
-    arms = [arm.name for arm in scene.arms]
     bearings = [joint.name for joint in system.mechanism.joints[len(arms) :]]
     for name, part in zip([*arms, *bearings], system.mechanism.slices, strict=True):
         names += [f"{name} q{k + 1}" for k in range(part.stop - part.start)]

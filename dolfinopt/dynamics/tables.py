@@ -12,11 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from dolfinopt.dynamics.collocation import lagrange
+from dolfinopt.errors import InputError
 from dolfinopt.multibody.rigid_motion import RigidMotion
+from dolfinopt.scene.csv_table import TIME, read_table
+from dolfinopt.scene.duration import stamp
 
 Function = Callable[[np.ndarray], np.ndarray]
 
@@ -131,3 +135,17 @@ def stage_values_of(
     values = values.reshape(len(h), len(nodes), -1)
     values[steps] = moments / lengths
     return values.reshape(-1, values.shape[2])
+
+
+def read_forces(file: str, columns: tuple[str, ...]) -> Table:
+    """Return a file's table of forces; it is kept until the file is written anew."""
+    return _read_forces(file, columns, stamp(file))
+
+
+@lru_cache(maxsize=16)
+def _read_forces(file: str, columns: tuple[str, ...], written: int) -> Table:
+    """Return what `read_forces` does; `written` tells versions of the file apart."""
+    table = read_table(file, columns)
+    if table.t is None:
+        raise InputError(f"{file}: expected a column {TIME} besides {', '.join(columns)}")
+    return Table(table.t, table.rows)

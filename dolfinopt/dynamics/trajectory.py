@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,8 +14,9 @@ from dolfinopt.dynamics.drive_forces import DriveForces
 from dolfinopt.dynamics.feed_forward import FeedForward, by_coefficients
 from dolfinopt.dynamics.machine_instants import MachineState
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.measured import FILE_ROUNDING
-from dolfinopt.motion.build import rests
+from dolfinopt.dynamics.march import BEYOND, REMEDY
+from dolfinopt.dynamics.measured import DEFLECTION_LIMIT
+from dolfinopt.dynamics.work import GivenUp
 from dolfinopt.multibody.closures import Along, Loops, Tie
 from dolfinopt.multibody.kinematics import (
     end_effector,
@@ -28,33 +28,9 @@ from dolfinopt.multibody.loads import load_coefficients
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import Rates, ShapeIntegrals
 from dolfinopt.multibody.tree import Mechanism
-from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-
-@dataclass(frozen=True)
-class JointLimit:
-    """How near a motion comes to one of a joint's limits.
-
-    Attributes:
-        joint: its name.
-        quantity: "position", "velocity" or "effort".
-        limit: of the coordinate, or of the absolute value.
-        value: where it is nearest to the limit or farthest beyond it.
-        instant: of that, s.
-        unit: of limit and value.
-        met: whether it stays within the limit.
-    """
-
-    joint: str
-    quantity: str
-    limit: float
-    value: float
-    instant: float
-    unit: str
-    met: bool
 
 
 class ByMotion(NamedTuple):
@@ -94,37 +70,26 @@ class Followed:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class MachineTrajectory:
     """A simulated motion; values at instants are those of the integrator's own interpolant.
 
     Attributes:
         problem: what moved, and how.
-        scene: its scene.
         solution: the integrator's.
-        t: (n,) instants at which responses look at the motion, see `response_instants`, s. Files
-            have those of `sampled`.
-        scenarios: the same design under the scene's scenarios.
-        feed_forward: what corrects its joints: its own, of a scenario the scene's; or None.
+        t: (n,) instants at which responses look at the motion, see `response_instants`, s.
+        scenarios: the same design under other conditions.
+        feed_forward: what corrects its joints: its own, of a scenario the nominal one; or None.
     """
 
     problem: MachineSystem
-    scene: Scene
     solution: Solution
     t: np.ndarray
-    scenarios: tuple[Trajectory, ...] = ()
+    scenarios: tuple[Self, ...] = ()
     feed_forward: FeedForward | None = None
 
     def at(self, t: np.ndarray) -> Self:
         """Return the same motion, without scenarios, seen at other instants (n,), s."""
         return replace(self, t=t, scenarios=())
-
-    @cached_property
-    def sampled(self) -> Self:
-        """The same motion every `simulation.sample`, as files have it."""
-        horizon, sample = self.scene.horizon, self.scene.simulation.sample
-        t = np.arange(round(horizon / sample) + 1) * sample
-        t = t[t <= horizon * (1 + 1e-12)]
-        return self if np.array_equal(t, self.t) else self.at(t)
 
     @property
     def solutions(self) -> tuple[Solution, ...]:
@@ -201,6 +166,18 @@ class Trajectory:
         """Largest deflection of every arm's end in its own frame, over its length (arms,)."""
         return self.mechanism.deflections(self.q_e)[0]
 
+    def check_deflections(self) -> None:
+        """Raise `GivenUp` where the motion is none of flexible arms any more."""
+        arms, deflections = self.problem.names.arms, self.deflections
+        worst = int(np.argmax(deflections)) if len(deflections) else 0
+        if not len(deflections) or deflections[worst] <= DEFLECTION_LIMIT:
+            return
+        name = f"arm {arms[worst]!r}" if worst < len(arms) else "a link"
+        raise GivenUp(
+            f"{name} deflects by {100.0 * deflections[worst]:.3g} % of its length: {BEYOND}; "
+            f"{REMEDY.replace('the arms', 'the arm', 1)}"
+        )
+
     @cached_property
     def interface_rotations(self) -> np.ndarray:
         """Largest rotation of every arm's outboard interface in the arm's frame (arms,), rad."""
@@ -236,7 +213,12 @@ class Trajectory:
     @property
     def closure(self) -> Tie | None:
         """What holds the last interface of a closed loop in the plane, or None."""
-        return self.loops.ties[0] if self.loops and not self.scene.is_spatial else None
+        return self.loops.ties[0] if self.loops and self.mechanism.dim.d == 2 else None
+
+    @property
+    def is_pinned(self) -> bool:
+        """Whether a pin holds the end-effector in the plane, which deviates from nothing then."""
+        return self.closure is not None and len(self.closure.equations) > 1
 
     @cached_property
     def closure_force(self) -> np.ndarray | None:
@@ -255,10 +237,10 @@ class Trajectory:
         forces, k = self.closure_force, 0
         if forces is None:
             return found
-        for one in self.scene.closures:
-            units = [unit for _, unit in one.parts(self.scene.dimension)]
+        for tie in self.problem.loops.ties if self.problem.loops else ():
+            units = tie.units
             own = forces[:, k : k + len(units)]
-            found[one.name] = {
+            found[tie.name] = {
                 unit: np.linalg.norm(own[:, [u == unit for u in units]], axis=1)
                 for unit in dict.fromkeys(units)
             }
@@ -299,7 +281,7 @@ class Trajectory:
 
     @cached_property
     def desired(self) -> RigidMotion:
-        """Rigid coordinates at the instants as the scene asks for them."""
+        """Rigid coordinates at the instants as they are asked for."""
         return (self.problem.path or self.problem.motion)(self.t)
 
     @cached_property
@@ -375,60 +357,6 @@ class Trajectory:
             closed = problem.loops.at(self.mechanism, self.motion.q[indices], self.q_e[indices])
             every -= closed.generalised_force(closed.closing(every, problem.drives.dependent))
         return every[:, rigid:]
-
-    @property
-    def joint_limits(self) -> tuple[JointLimit, ...]:
-        """How the motion stands to the limits that the scene states of its joints."""
-        return tuple(self._joint_limits())
-
-    def _joint_limits(self) -> Iterator[JointLimit]:
-        for k, joint in enumerate(self.scene.movable):
-            unit, force = ("m", "N") if joint.type == "prismatic" else ("rad", "N m")
-            if joint.position_limits is not None:
-                (lower, upper), q = joint.position_limits, self.motion.q[:, k]
-                sides = (lower - q, lower), (q - upper, upper)
-                over, limit = max(sides, key=lambda side: float(side[0].max()))
-                size = max(upper - lower, abs(limit)) or 1.0
-                yield self._nearest(joint.name, "position", limit, q, over / size, unit)
-            for quantity, bound, values, of in (
-                ("velocity", joint.velocity_limit, self.motion.qd, f"{unit}/s"),
-                ("effort", joint.effort_limit, self.joint_forces, force),
-            ):
-                if bound is not None:
-                    size = np.abs(values[:, k])
-                    yield self._nearest(joint.name, quantity, bound, size, size / bound - 1.0, of)
-
-    def _nearest(
-        self,
-        joint: str,
-        quantity: str,
-        limit: float,
-        values: np.ndarray,
-        over: np.ndarray,
-        unit: str,
-    ) -> JointLimit:
-        """Return where values (n,) are nearest to a limit; `over` is relative, above 0 beyond."""
-        k = int(np.argmax(over))
-        met = bool(over[k] <= FILE_ROUNDING)
-        return JointLimit(joint, quantity, limit, float(values[k]), float(self.t[k]), unit, met)
-
-    @property
-    def settling(self) -> float:
-        """Largest deviation in any rest: after the motion and in its dwells, see `rests`, m.
-
-        With a horizon that ends with the motion, the deviation at its end.
-        """
-        return float(self.distance[self.at_rest].max())
-
-    @property
-    def at_rest(self) -> np.ndarray:
-        """Which instants are in a rest (n,); the last one is in any case."""
-        rounding, t = 1e-9 * self.scene.horizon, self.t - self.scene.lead
-        found = np.zeros(len(t), dtype=bool)
-        for begin, end in rests(self.scene):
-            found |= (t >= begin - rounding) & (t <= end + rounding)
-        found[-1] = True
-        return found
 
     @property
     def drives(self) -> tuple[np.ndarray, np.ndarray]:

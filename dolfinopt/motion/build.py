@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache, wraps
 from typing import TYPE_CHECKING, TypeVar
 
@@ -11,41 +11,43 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.motion.constraints import Constraints, Target
-from dolfinopt.motion.machine import loops_of, skeleton
 from dolfinopt.motion.measured import DENSE_INSTANTS, TABLE_CORNERS_LIMIT
-from dolfinopt.motion.paths import (
-    Curve,
-    along,
-    arc,
-    curve_by_chord,
-    curve_by_laws,
-    curve_in_time,
-    inverse,
-    moves,
-    rotation,
-)
+from dolfinopt.motion.paths import Curve, along, arc, rotation
 from dolfinopt.motion.plane import Chain
 from dolfinopt.motion.poses import RPY, VECTOR, orientations, relative_vectors, turning
-from dolfinopt.multibody.closures import Loops
+from dolfinopt.motion.tables import Rows, accelerations, curve_through, instants_of, is_free
+from dolfinopt.multibody.body import Constants
+from dolfinopt.multibody.closures import Along, Distance, Equation, Facing, Loops, Tie
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.rotations import roll_pitch_yaw
-from dolfinopt.scene.csv_table import BESIDE_JOINTS, TIME, Table, column_names, read_table
-from dolfinopt.scene.duration import (
-    POINT,
-    SAME_TIME,
-    SPACE_POINT,
-    file_stamp,
-    known_law,
-    limits_of,
-    time_law,
-    too_short,
+from dolfinopt.multibody.rotations import ONE, roll_pitch_yaw
+from dolfinopt.multibody.shape_integrals import (
+    ShapeIntegrals,
+    rigid_bar,
+    rigid_body,
+    rigid_spatial_body,
 )
-from dolfinopt.scene.laws import Limits, Values
-from dolfinopt.scene.load import Motion, Scene
+from dolfinopt.multibody.tree import (
+    GROUND,
+    Friction,
+    Joint,
+    Mechanism,
+    Rotor,
+    Site,
+    bearing_body,
+    with_bearings,
+)
+from dolfinopt.scene.csv_table import BESIDE_JOINTS, TIME, Table, column_names, read_table
+from dolfinopt.scene.duration import POINT, SAME_TIME, SPACE_POINT, file_stamp, time_law
+from dolfinopt.scene.laws import Values
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.arms import Arm
+from dolfinopt.scene.tables.closures import Closures
+from dolfinopt.scene.tables.joints import JointParts, joint_parts, place_of
 
 if TYPE_CHECKING:
     from dolfinopt.motion.follower import Follower
 
+Inertia = tuple[float, ...]
 CART = "cart"  # first column of a table of joints
 TABLES = "points", "joints"  # paths that are tables
 Result = TypeVar("Result")
@@ -119,7 +121,7 @@ def breakpoints(scene: Scene) -> tuple[float, ...]:
     if not timed:
         few = corners if len(corners) <= TABLE_CORNERS_LIMIT else corners[:0]
         knots = time_law(motion).knots * motion.duration
-        corners = np.concatenate([_when(few, motion), knots])
+        corners = np.concatenate([instants_of(few, motion), knots])
     instants = np.sort(np.append(corners, motion.duration))
     apart = np.diff(instants, prepend=0.0) > SAME_TIME * motion.duration
     apart &= instants < motion.horizon * (1.0 - SAME_TIME)
@@ -131,7 +133,7 @@ def table_rows(scene: Scene) -> np.ndarray:
     if scene.motion.path not in TABLES:
         return np.zeros(0)
     curve, timed = curve_of(scene)
-    return curve.u if timed else _when(curve.u[1:-1], scene.motion)
+    return curve.u if timed else instants_of(curve.u[1:-1], scene.motion)
 
 
 def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
@@ -164,79 +166,13 @@ def rests(scene: Scene) -> tuple[tuple[float, float], ...]:
     return tuple((begin + delay, end) for begin, end in joined)
 
 
-def _when(s: np.ndarray, motion: Motion) -> np.ndarray:
-    """Return the instants at which the time law reaches s, in (0, 1)."""
-    if not len(s):
-        return s
-    law, last = time_law(motion), motion.duration
-    return inverse(lambda t: law(t, last)[0], s, 0.0, last)
-
-
 # -- tables ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """A table of joints, or of points, rotation vectors and further joints.
-
-    Attributes:
-        table: its rows, rotation vectors against the first row.
-        start: the first row's orientation (3, 3), or None.
-        measured: number of columns, the first ones, whose distance counts; None: all.
-    """
-
-    table: Table
-    start: np.ndarray | None = None
-    measured: int | None = None
 
 
 @_kept
 def curve_of(scene: Scene) -> tuple[Curve, bool]:
     """Return the curve through the scene's table, and whether its parameter is time."""
-    motion, rows = scene.motion, rows_of(scene)
-    table = rows.table
-    if table.t is None:
-        return curve_by_chord(table, rows.measured), False
-    last = table.t[-1]
-    if abs(last - motion.duration) > SAME_TIME * motion.duration:
-        raise InputError(
-            f"{table.file}: line {table.lines[-1]}, column t = {last:g}: expected "
-            f"motion.duration = {motion.duration:g} [s] in the last row; set motion.duration = "
-            f"{last:g}"
-        )
-    if _is_free(motion):
-        return curve_in_time(table, motion.table_ends == "moving"), True
-    return _stop_to_stop(motion, rows), True
-
-
-def _is_free(motion: Motion) -> bool:
-    """Return whether a table with times is followed by a spline: no law, no limits."""
-    return motion.law == Motion.model_fields["law"].default and not limits_of(motion).any
-
-
-def _stop_to_stop(motion: Motion, rows: Rows) -> Curve:
-    """Return the motion through a table with times that runs straight by the law between stops."""
-    table, laws = rows.table, []
-    assert table.t is not None
-    for i, j in moves(table.rows):
-        if j - i > 1:
-            raise InputError(
-                f"{table.file}: line {table.lines[i + 1]}: a row between two stops with motion.law "
-                f"= {motion.law!r} or limits, by which each move runs from stop to stop; repeat "
-                f"the row at a later {TIME} to stop there, leave it out, or leave out the column "
-                f"{TIME}, the law's name and the limits"
-            )
-        length = float(np.linalg.norm((table.rows[j] - table.rows[i])[: rows.measured]))
-        limits = limits_of(motion) if length > 0.0 else Limits()  # of turns on the spot none
-        law = known_law(motion.law, length, limits, motion.acceleration_share)
-        time = float(table.t[j] - table.t[i])
-        if time < law.least * (1.0 - SAME_TIME):
-            raise InputError(
-                f"{table.file}: line {table.lines[j]}, column {TIME} = {table.t[j]:g}: {time:g} s "
-                f"for this move: {too_short(law)}"
-            )
-        laws.append((i, j, law))
-    return curve_by_laws(table, laws)
+    return curve_through(rows_of(scene), scene.motion)
 
 
 @_kept
@@ -301,10 +237,9 @@ def forced_rest(scene: Scene) -> str | None:
         return None
     table = rows_of(scene).table
     # Fewer than six rows do not tell their own acceleration: the spline's degree is 5.
-    if table.t is None or not _is_free(motion) or len(table.t) < 6:
+    if table.t is None or not is_free(motion) or len(table.t) < 6:
         return None
-    t = np.linspace(0.0, table.t[-1], max(DENSE_INSTANTS, 4 * len(table.t)))
-    forced, own = (np.abs(curve_in_time(table, k)(t)[2]).max(axis=0) for k in (False, True))
+    forced, own = accelerations(table)
     beyond = forced > 10.0 * own
     if not beyond.any():
         return None
@@ -465,3 +400,209 @@ def loop_start(scene: Scene) -> dict[str, float]:
 def misfit(scene: Scene) -> float:
     """Return by how much rigid links leave closed loops open at t = 0, m; 0 by rounding."""
     return follower(scene).start.misfit if scene.closures else 0.0
+
+
+# -- the machine ------------------------------------------------------------------------------
+
+
+def build_mechanism(scene: Scene, bodies: Sequence[ShapeIntegrals]) -> Mechanism:
+    """Return the scene's machine, of bodies in the order of its arms."""
+    friction = friction_of(scene, soft=False)
+    bearings = {
+        k: bearing_body(one.bearing[0], one.bearing[1], scene.dimension)
+        for k, one in enumerate(joint_parts(scene))
+        if one.bearing is not None
+    }
+    mechanism = _tree(scene, bodies, _loads(scene), friction if friction.acts else None)
+    return with_bearings(mechanism, bearings)
+
+
+def skeleton(scene: Scene) -> Mechanism:
+    """Return the scene's joints and interfaces without any mass: what moves rigid links."""
+    if not scene.is_spatial:
+        return _tree(scene, [rigid_bar(arm.length, arm.height, 0.0, 0.0) for arm in scene.arms], {})
+    points = [arm.interface_points for arm in scene.arms]
+    none = np.zeros(3), np.zeros(6)
+    return _tree(scene, [rigid_spatial_body(0.0, *none, one[0], one[1:]) for one in points], {})
+
+
+def _tree(
+    scene: Scene,
+    bodies: Sequence[ShapeIntegrals],
+    loads: Mapping[Site, Constants],
+    friction: Friction | None = None,
+) -> Mechanism:
+    """Return bodies on the scene's joints and its base."""
+    motion, d = scene.motion, scene.dimension
+    gravity = motion.gravity[:d] if len(motion.gravity) >= d else np.zeros(d)
+    return Mechanism(
+        bodies=tuple(bodies),
+        joints=joints_of(scene),
+        loads=loads,
+        gravity=np.array(gravity, dtype=float)[:, None],
+        end=scene.end_effector,
+        origin=np.zeros(3) if scene.is_spatial else np.array([0.0, motion.joint_height]),
+        cart=None if scene.is_spatial else motion.cart_mass,
+        friction=friction,
+        rods=len(scene.rods),
+    )
+
+
+# -- bodies: rigid arms, payload, what sits at joints ----------------------------------------
+
+
+def rigid_link(arm: Arm, density: float, dimension: int = 3) -> ShapeIntegrals:
+    """Return a rigid arm's body: as stated, or of the solid bar of length, height, thickness.
+
+    Args:
+        arm: of the scene.
+        density: of its material, kg/m3.
+        dimension: of the machine, 2 or 3.
+    """
+    x, y, z = arm.length, arm.height, arm.thickness
+    mass = density * x * y * z if arm.mass is None else arm.mass
+    inertia = arm.inertia
+    if dimension == 2:
+        assert not isinstance(inertia, tuple)  # the scene would have refused it
+        return rigid_bar(x, y, mass, inertia)
+    if inertia is None:
+        squares = (y * y + z * z, x * x + z * z, x * x + y * y)
+        inertia = (*(mass * square / 12.0 for square in squares), 0.0, 0.0, 0.0)
+    centre = (0.5 * x, 0.0, 0.0) if arm.centre is None else arm.centre
+    further = arm.interface_points[1:]
+    return rigid_spatial_body(mass, centre, _tensor(inertia), (x, 0.0, 0.0), further)
+
+
+def _tensor(inertia: float | Inertia) -> Inertia:
+    """Return xx, yy, zz, xy, xz, yz; a number is the moment about every axis."""
+    return inertia if isinstance(inertia, tuple) else (*[inertia] * 3, 0.0, 0.0, 0.0)
+
+
+def _loads(scene: Scene) -> dict[Site, Constants]:
+    """Return what the arms carry at interfaces without a joint: motors and the payload."""
+    payload, found = scene.payload, {}
+    inertia = payload.inertia if scene.is_spatial else payload.moment
+    found[scene.end_effector] = _carried(scene, payload.mass, inertia, payload.offset)
+    for k, arm in enumerate(scene.arms):
+        if arm.joint_mass or arm.joint_inertia:
+            motor = _carried(scene, arm.joint_mass, arm.joint_inertia)
+            found[k, 0] = motor + found[k, 0] if (k, 0) in found else motor
+    return {site: Constants(body) for site, body in found.items()}
+
+
+def _carried(
+    scene: Scene, mass: float, inertia: float | Inertia, offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> ShapeIntegrals:
+    """Return a rigid body in an interface's frame."""
+    if scene.is_spatial:
+        return rigid_spatial_body(mass, np.array(offset), _tensor(inertia))
+    assert not isinstance(inertia, tuple)
+    return rigid_body(mass, np.zeros(2), inertia, np.zeros(2))
+
+
+# -- joints, and what is in them -------------------------------------------------------------
+
+
+def joints_of(scene: Scene) -> tuple[Joint, ...]:
+    """Return the joints that hold the arms, in the arms' order."""
+    if not scene.is_spatial:
+        flat = np.ones(1), np.zeros(2), np.eye(2)
+        return tuple(
+            Joint(arm.name, "revolute", k - 1, k + 1, *flat, rotor)
+            for k, (arm, rotor) in enumerate(zip(scene.arms, rotors_of(scene), strict=True))
+        )
+    by_child = {joint.child: joint for joint in scene.joints}
+    joints, columns = [], scene.joint_columns
+    for arm, coordinate, rotor in zip(scene.arms, columns, rotors_of(scene), strict=True):
+        one = by_child[arm.name]
+        parent, interface = place_of(scene, one.parent) or (GROUND, 0)
+        joints.append(
+            Joint(
+                name=one.name,
+                kind=one.type,
+                parent=parent,
+                coordinate=coordinate,
+                axis=_unit((0.0, 0.0, 1.0) if one.axis is None else one.axis),
+                origin=np.array(one.origin, dtype=float),
+                rotation=roll_pitch_yaw(one.rpy),
+                rotor=rotor,
+                interface=interface,
+            )
+        )
+    return tuple(joints)
+
+
+def friction_of(scene: Scene, soft: bool) -> Friction:
+    """Return the friction (R,) of joints, or of the motors before `soft` gears."""
+    found = Friction.none(scene.num_rigid)
+    for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True):
+        if k is not None and one.friction is not None and (one.stiffness > 0.0) == soft:
+            found.viscous[k], found.coulomb[k], found.speed[k] = one.friction
+    return found
+
+
+def soft_joints(scene: Scene) -> dict[int, JointParts]:
+    """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
+    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
+    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
+    return dict(sorted(found.items()))
+
+
+def rotors_of(scene: Scene) -> list[Rotor | None]:
+    """Return the rotor of every arm's joint: behind a gear's spring a motor of its own."""
+    motors: dict[int | None, int] = {k: place for place, k in enumerate(soft_joints(scene))}
+    return [
+        Rotor(one.rotor, one.ratio, motors.get(k)) if k in motors or one.rotor > 0.0 else None
+        for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True)
+    ]
+
+
+# -- what closes loops -----------------------------------------------------------------------
+
+
+def loops_of(scene: Scene) -> Loops | None:
+    """Return the scene's closures; None of a tree."""
+    if not scene.closures:
+        return None
+    d, reach, first = scene.dimension, skeleton(scene).reach, len(scene.movable)
+    places = {one.name: first + k for k, one in enumerate(scene.rods)}
+    ties = []
+    for one in scene.closures:
+        a, b = (place_of(scene, end) for end in one.between)
+        assert a is not None
+        equations = _equations(one, d, reach, places.get(one.name))
+        point, rotation = np.array(one.point[:d], dtype=float), roll_pitch_yaw(one.rpy)[:d, :d]
+        ties.append(Tie(one.name, a, b, point, rotation, equations))
+    return Loops(tuple(ties))
+
+
+# Which axes of the two frames face each other: 0 along the closure's axis, 1 and 2 across it.
+FACING = {
+    "ball": (),
+    "pin": ((0, 1), (0, 2)),
+    "slider": ((1, 2), (2, 0), (0, 1)),
+    "universal": ((1, 0),),
+}
+
+
+def _equations(one: Closures, d: int, reach: float, place: int | None) -> tuple[Equation, ...]:
+    """Return a closure's equations; vectors of the second frame are in the joint's."""
+    if one.kind == "rod":
+        return (Distance(0.0 if place is not None else one.length or 0.0, place),)
+    frame = np.eye(d) if one.kind == "ball" or (d == 2 and one.kind == "pin") else _frame(one, d)
+    lines = frame[1:] if one.kind == "slider" else np.eye(d)
+    pairs = FACING[one.kind] if d == 3 else ()
+    return (*map(Along, lines), *(Facing(frame[i], frame[j], reach) for i, j in pairs))
+
+
+def _frame(one: Closures, d: int) -> np.ndarray:
+    """Return the direction of a closure's axis and those across it (d, d), a row each."""
+    axis = _unit((one.axis or ())[:d])
+    if d == 2:
+        return np.array([axis, [-axis[1], axis[0]]])
+    across = _unit(one.cross_axis or np.cross(axis, ONE[int(np.argmin(np.abs(axis)))]))
+    return np.array([axis, across, np.cross(axis, across)])
+
+
+def _unit(v: Sequence[float] | np.ndarray) -> np.ndarray:
+    return np.asarray(v, dtype=float) / np.linalg.norm(v)

@@ -164,6 +164,11 @@ class Tie:
         """Whether its frames are apart."""
         return isinstance(self.equations[0], Distance)
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of every equation's force or moment."""
+        return tuple("N m" if isinstance(one, Facing) else "N" for one in self.equations)
+
 
 @dataclass(frozen=True, eq=False)
 class Loops:

@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import uniform_design
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator

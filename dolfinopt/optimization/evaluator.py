@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.arms.arm import Patterns, PhysicalDesign
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.optimization.problem import EvaluatedDesign
 from dolfinopt.optimization.projection import Projection
 from dolfinopt.optimization.variables import Variables

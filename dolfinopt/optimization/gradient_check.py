@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.certificate import compared, without_exact_gradient
 from dolfinopt.optimization.evaluator import Evaluator, densities

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.optimization.stopping import StopCode
 from dolfinopt.parallel import Partition

@@ -13,7 +13,7 @@ from dolfinopt.scene.csv_table import BESIDE_JOINTS
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
 
 FILE = "feed_forward.csv"
 

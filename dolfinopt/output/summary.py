@@ -19,12 +19,13 @@ from dolfinopt.density.measured import GREY
 from dolfinopt.density.members import Width, Widths, widths_of
 from dolfinopt.disk import write_text
 from dolfinopt.dynamics.budget import deflection_budget
-from dolfinopt.dynamics.trajectory import JointLimit, Trajectory
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
 from dolfinopt.output.feed_forward import summary_of_feed_forward
+from dolfinopt.output.joint_limits import JointLimit, joint_limits
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import (
     drive_units,
@@ -42,7 +43,6 @@ from dolfinopt.scene.messages import implausible
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
-    from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.optimization.result import RankResult, Result
 
 # Of summary.json's figures; those without a unit are "-". Constraints state theirs themselves.
@@ -411,8 +411,8 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         "drive_peak": by_drive(peak),
         "drive_rms": by_drive(rms),
     }
-    if trajectory.joint_limits:
-        found["joint_limits"] = _by_joint(trajectory.joint_limits)
+    if of_joints := _by_joint(joint_limits(trajectory)):
+        found["joint_limits"] = of_joints
     if free := free_drives(scene):
         errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
         found["drive_error_peak"] = {name: errors[name] for name in free}
@@ -448,7 +448,7 @@ def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
         return []
     beyond = [
         f"{one.joint} {one.value:.4g} of {one.limit:.4g} {one.unit} at {one.instant:.3g} s"
-        for one in trajectory.joint_limits
+        for one in joint_limits(trajectory)
         if not one.met
     ]
     return [f"limits exceeded: {', '.join(beyond)}"] if beyond else []

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 
 # Errors of the torsion constant of square sections of n x n cells, relative to Saint-Venant's:

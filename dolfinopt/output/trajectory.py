@@ -16,7 +16,7 @@ BEHIND = "; behind them the bearings', m and rad"
 FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit
 
 if TYPE_CHECKING:
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
 
 
 def write_trajectory(

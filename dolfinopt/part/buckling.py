@@ -13,7 +13,7 @@ from dolfinopt.responses.motion import motions_of
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from dolfinopt.arms.arm import Arm
+    from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.dynamics.collocation import Solution
-    from dolfinopt.dynamics.trajectory import Trajectory
     from dolfinopt.parallel import Partition
     from dolfinopt.responses.evaluation import Evaluation
 

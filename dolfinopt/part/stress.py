@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.arms.arm import Arm
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.domain import SolidDomain
     from dolfinopt.part.part import Part

@@ -40,7 +40,7 @@ from dolfinopt.plots.style import (
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
 
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
 
 FRAMES, FILM_SECONDS = 60, 6.0
 FILM_WIDTH, FILM_DPI = 9.0, 100  # inches, px per inch

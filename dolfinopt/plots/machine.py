@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
 
 # Shares of the arms' reach.
 BAR = 0.025  # largest height of a rigid arm

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.multibody.closures import Loops
 
 MOST = (10.0, 8.0)  # inches, of the picture

@@ -13,10 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.arm import chain_of, stiffening_of
-from dolfinopt.dynamics.build import largest_stiffness_change
+from dolfinopt.dynamics.build import Trajectory, largest_stiffness_change, simulate
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.dynamics.simulation import simulate
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals

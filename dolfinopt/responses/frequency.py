@@ -10,8 +10,7 @@ import numpy as np
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.modes import FrozenTree, LoadedModes
-from dolfinopt.motion.build import rigid_motion
-from dolfinopt.motion.machine import build_mechanism
+from dolfinopt.motion.build import build_mechanism, rigid_motion
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import on_all_ranks, on_root, together

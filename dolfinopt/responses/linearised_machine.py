@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.arms.arm import chain_of
-from dolfinopt.dynamics.simulation import simulate
-from dolfinopt.dynamics.state_space import StateSpace, check_instant, state_space
+from dolfinopt.dynamics.build import check_instant, simulate, state_space
+from dolfinopt.dynamics.state_space import StateSpace
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.parallel import Partition, on_root, together
 from dolfinopt.profiling import Profile

@@ -9,7 +9,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from dolfinopt.dynamics.trajectory import ByMotion, Followed, Trajectory
+from dolfinopt.dynamics.build import Trajectory
+from dolfinopt.dynamics.trajectory import ByMotion, Followed
 from dolfinopt.motion.build import CART
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
 from dolfinopt.parallel import on_root, together

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
 from dolfinopt.parallel import Partition, gather_arms, on_root, together

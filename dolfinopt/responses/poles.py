@@ -13,9 +13,10 @@ from typing import ClassVar
 
 import numpy as np
 
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.linearised import linearised
 from dolfinopt.dynamics.poles import Poles, damping_ratios, poles_of
-from dolfinopt.dynamics.trajectory import ByMotion, Trajectory
+from dolfinopt.dynamics.trajectory import ByMotion
 from dolfinopt.multibody.shape_integrals import integrals_of
 from dolfinopt.responses.measured import DAMPING_EXPONENT
 from dolfinopt.responses.motion import LoadCases, MotionResponse

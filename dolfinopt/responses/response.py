@@ -41,7 +41,7 @@ from dolfinopt.scene.tables.responses import (
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.profiling import Profile
     from dolfinopt.scene.tables.objective import Objective
 

@@ -12,8 +12,9 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.design_state import DesignState
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.load_gradient import load_counts, load_gradient
-from dolfinopt.dynamics.trajectory import Followed, Trajectory
+from dolfinopt.dynamics.trajectory import Followed
 from dolfinopt.fem.stress import DisplacementGradient, LoadFields
 from dolfinopt.fem.tensors import element_centre
 from dolfinopt.multibody.dimension import DIMENSIONS

@@ -22,7 +22,7 @@ from dolfinopt.responses.stress import (
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
-    from dolfinopt.dynamics.trajectory import Trajectory
+    from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import Scene
 

@@ -122,7 +122,7 @@ def read_side(
     InputError where it has no summary.json or trajectory.npz, or another machine's.
     """
     from dolfinopt.arms.arm import chain_of
-    from dolfinopt.motion.machine import build_mechanism
+    from dolfinopt.motion.build import build_mechanism
 
     summary = _summary(folder)
     mechanism = build_mechanism(scene, chain_of(scene, bodies))

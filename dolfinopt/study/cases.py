@@ -31,8 +31,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.disk import make_folder, write_arrays, write_text
-from dolfinopt.dynamics.simulation import simulate_all
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.build import Trajectory, simulate_all
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.optimization.result import RankResult, simulation_result

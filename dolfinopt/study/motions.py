@@ -19,8 +19,7 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.disk import make_folder, write_text
-from dolfinopt.dynamics.build import build_system, desired_motion
-from dolfinopt.dynamics.simulation import simulate
+from dolfinopt.dynamics.build import build_system, desired_motion, simulate
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals

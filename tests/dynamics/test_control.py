@@ -20,10 +20,10 @@ from machines import (
 from machines import small_two_arm as small
 from runs import TWO_ARM, overrides, run
 
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.drives import saturated
 from dolfinopt.dynamics.measured import LINEAR_DRIVE_SHARE
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank

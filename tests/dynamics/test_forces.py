@@ -11,7 +11,7 @@ from machines import energies, fork, trajectory_of, two_arm, with_keys
 from runs import scene
 
 import dolfinopt as do
-from dolfinopt.dynamics.simulation import simulate_all
+from dolfinopt.dynamics.build import simulate_all
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict

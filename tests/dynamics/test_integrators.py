@@ -384,7 +384,7 @@ def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatc
     remedy = r"deflects by [0-9.]+ % .*50 %.*young_modulus"
     with pytest.raises(ConvergenceError, match="t = .* an arm " + remedy):
         arms_of_a_scene("motion.duration=0.45")
-    monkeypatch.setattr("dolfinopt.dynamics.simulation.DEFLECTION_LIMIT", 0.01)
+    monkeypatch.setattr("dolfinopt.dynamics.trajectory.DEFLECTION_LIMIT", 0.01)
     with pytest.raises(ConvergenceError, match="arm1.*" + remedy):
         arms_of_a_scene("motion.duration=1.0", "payload.mass=1")
 

@@ -9,8 +9,8 @@ import pytest
 from loops import bennett, closed, cranks
 
 import dolfinopt as do
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 
 pytestmark = pytest.mark.serial

@@ -18,9 +18,9 @@ from runs import TWO_ARM, overrides, run, scene, summary_of
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import measured, radau
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import rounding_error

@@ -10,10 +10,10 @@ from machines import controlled, loop_tree, trajectory_of, two_arm, with_keys
 from runs import ROOT, refusal
 
 import dolfinopt as do
+from dolfinopt.dynamics.build import Trajectory, free_machine, state_space
 from dolfinopt.dynamics.linearised import Linearised
 from dolfinopt.dynamics.poles import poles_of
-from dolfinopt.dynamics.state_space import StateSpace, free_machine, state_space
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.state_space import StateSpace
 from dolfinopt.responses.linearised_machine import accurate_below
 from dolfinopt.scene.load import Scene, scene_from_dict
 
@@ -70,8 +70,7 @@ def test_stiff_drive_clamps_the_beam(tmp_path) -> None:
 
 
 def machine_at(trajectory: Trajectory, t: float) -> Linearised:
-    rates = trajectory.at(np.array([t])).unknowns
-    return free_machine(trajectory.scene, trajectory.problem, t, rates)
+    return free_machine(trajectory, t)
 
 
 def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:

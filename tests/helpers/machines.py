@@ -10,10 +10,10 @@ import numpy as np
 from runs import ROOT, TWO_ARM, by_root, scene
 
 import dolfinopt as do
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.model import SimulationResult
 from dolfinopt.multibody.dimension import product
 from dolfinopt.multibody.kinematics import Posed

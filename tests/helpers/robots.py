@@ -8,7 +8,7 @@ import numpy as np
 from runs import ROOT, run, tomllib
 from scipy.spatial.transform import Rotation
 
-from dolfinopt.motion.machine import build_mechanism, rigid_link
+from dolfinopt.motion.build import build_mechanism, rigid_link
 from dolfinopt.multibody.shape_integrals import rigid_spatial_body
 from dolfinopt.multibody.tree import GROUND, Mechanism
 from dolfinopt.scene.load import read_scene

@@ -10,8 +10,7 @@ from runs import refused, tomllib
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.dynamics.build import check_motion
-from dolfinopt.motion.build import breakpoints, rigid_motion, target_of
-from dolfinopt.motion.machine import skeleton
+from dolfinopt.motion.build import breakpoints, rigid_motion, skeleton, target_of
 from dolfinopt.motion.poses import relative_vectors
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.scene.load import read_scene, scene_from_dict

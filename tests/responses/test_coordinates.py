@@ -13,7 +13,7 @@ from runs import TWO_ARM, overrides, refused, run, summary_of
 
 import dolfinopt as do
 from dolfinopt.cli.shared import scene_of
-from dolfinopt.dynamics.simulation import simulate
+from dolfinopt.dynamics.build import simulate
 from dolfinopt.optimization import assessment, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.responses import order_selection as coordinates

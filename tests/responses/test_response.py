@@ -11,7 +11,7 @@ from remainders import beside_volume, build, limit_rates, wave
 from runs import TWO_ARM
 
 import dolfinopt as do
-from dolfinopt.dynamics.trajectory import Trajectory
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.parallel import on_all_ranks, together
 from dolfinopt.responses.motion import Deviation
 from dolfinopt.responses.response import (

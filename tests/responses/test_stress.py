@@ -15,8 +15,8 @@ from runs import ROOT, TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.load_gradient import ProbedSystem
-from dolfinopt.dynamics.trajectory import Trajectory
 from dolfinopt.fem.stress import places_of, stress_operator
 from dolfinopt.multibody.newton_euler import outward_pass
 from dolfinopt.responses.response import Analysis, CellGradient, Measured, find

@@ -9,7 +9,7 @@ from scenes import put_at
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
-from dolfinopt.motion.machine import build_mechanism, rigid_link
+from dolfinopt.motion.build import build_mechanism, rigid_link
 from dolfinopt.scene.load import read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial

@@ -15,7 +15,7 @@ from runs import ROOT, TWO_ARM, refusal, refused, scene
 from scenes import put_at
 
 from dolfinopt.dynamics.build import build_system, check_forces, check_motion
-from dolfinopt.motion.machine import loops_of
+from dolfinopt.motion.build import loops_of
 from dolfinopt.scene.load import pose_scenarios, read_scene, scene_from_dict
 from dolfinopt.scene.messages import implausible
 
