@@ -360,11 +360,15 @@ class Mechanism:
     def deflections(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return every arm's largest deflection over its length, and its largest rotation, rad.
 
-        Those (arms,) of its outboard interfaces in its own frame along q (n, N).
+        Those (arms,) of its outboard interfaces in its own frame along q (n, N), with the way by
+        which bending shortens a stiffened arm, -1/2 q' K0 q.
         """
         d, b, found = self.dim.d, self.dim.b, np.zeros((2, self.num_arms))
         for k, (part, body) in enumerate(zip(self.slices, self.arms)):
-            moved = (q[:, part] @ body.outboard.T).reshape(-1, b)  # each interface
+            moved = q[:, part] @ body.outboard.T
+            if body.is_stiffened:
+                moved -= 0.5 * (q[:, part] @ body.K0_outboard * q[:, part]).sum(axis=2).T
+            moved = moved.reshape(-1, b)  # each interface
             parts = np.split(moved, [d], axis=1)
             sizes = [np.linalg.norm(x, axis=1).max(initial=0.0) for x in parts]
             length = np.linalg.norm(self.constants[k].points, axis=1).max()

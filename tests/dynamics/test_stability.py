@@ -400,6 +400,19 @@ def test_millimetres_and_tonnes(overrides, in_metres, in_millimetres) -> None:
         np.testing.assert_allclose(mm_slopes[k] / factor, slopes, atol=3e-6 * scale)
 
 
+def test_deflections_count_what_bending_shortens() -> None:
+    """A beam bent by w at its tip gets shorter by 3 w^2 / 5 L, w' = 3 w (2 x - x^2) / 2 L."""
+    built = build("simulation.stiffening=true", cells=(60, 3))
+    trajectory = built.evaluate(built.fields(DESIGNS["solid"]))[1]
+    mechanism, body = trajectory.mechanism, trajectory.mechanism.arms[0]
+    bent = np.linalg.solve(body.K, body.outboard[1])
+    w = 0.4 * mechanism.constants[0].points[0, 0]
+    q = np.zeros((1, mechanism.num_coordinates))
+    q[0, mechanism.slices[0]] = w * bent / (body.outboard[1] @ bent)
+    share = mechanism.deflections(q)[0][0]
+    assert share == pytest.approx(np.hypot(0.4, 0.6 * 0.4**2), rel=2e-3)
+
+
 def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
     """A tenth of an arm's length: in summary.json and on standard error, arm by arm."""
     heavy = ["payload.mass=40", "arms.arm2.young_modulus=1e12"]
