@@ -47,6 +47,7 @@ from dolfinopt.output.design import (
     gather_views,
     physical,
     read_design,
+    under_law_of,
 )
 from dolfinopt.output.folders import check_unused, working_alone
 from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms, together
@@ -57,6 +58,7 @@ from dolfinopt.responses.evaluation import constraint_gradients, evaluate, gradi
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
+from dolfinopt.scene.law_variables import law_values, with_law
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import GradientKind
 from dolfinopt.scene.toml import toml_value
@@ -374,16 +376,17 @@ class Model:
             ConvergenceError: the motion could not be simulated; the message says what to try.
         """
         partition, arms, x_phys = self._prepared(x)
-        choice = choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
-        evaluation, trajectory = evaluate(self.scene, partition, arms, x_phys, self._profile)
+        place = self._under_law(x), partition, arms, x_phys
+        choice = choose_coordinates(*place, self._profile)
+        evaluation, trajectory = evaluate(*place, self._profile)
         found = stress_report(partition, arms, trajectory, self._profile) if stress else None
-        views = gather_views(self.scene, partition, arms, x_phys, found)
+        views = gather_views(*place, found)
         points = [one.peak_at_points.value for one in (found or {}).values()]
         return SimulationResult(
-            scene=self.scene,
+            scene=place[0],
             evaluation=evaluation,
             trajectory=trajectory,
-            limits=limits_of(self.scene, evaluation),
+            limits=limits_of(place[0], evaluation),
             choice=choice,
             design=self._gathered(x_phys),
             views=views,
@@ -700,6 +703,13 @@ class Model:
         sizes = {k: partition.comm.allgather(arm.mesh.num_cells) for k, arm in arms.items()}
         parts = {k: np.cumsum([0, *size])[partition.comm.rank :] for k, size in sizes.items()}
         return partition, arms, {k: whole[k][part[0] : part[1]] for k, part in parts.items()}
+
+    def _under_law(self, x: Design) -> Scene:
+        """Return the scene, with the law of a design that has one."""
+        if isinstance(x, SimulationResult):
+            return with_law(self.scene, law_values(x.scene))
+        path = Path(x) if isinstance(x, (str, os.PathLike)) else None
+        return on_root(self._world, under_law_of, self.scene, path)
 
     def _checked(self, x: Densities) -> dict[int, np.ndarray]:
         """Return a user's densities in the order of the ranks' cells (root only)."""

@@ -176,8 +176,8 @@ def _export_state_space(
         design, folder = source / "design.npz", out or source / "state-space"
     world, loaded = _machine(source, overrides)
     from dolfinopt.dynamics.build import check_instant
-    from dolfinopt.output.design import arms_with_design
-    from dolfinopt.parallel import together
+    from dolfinopt.output.design import arms_with_design, under_law_of
+    from dolfinopt.parallel import on_root, together
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.linearised_machine import linearised_machine
     from dolfinopt.responses.order_selection import choose_coordinates
@@ -185,6 +185,7 @@ def _export_state_space(
     check_instant(loaded, instant)
     claim(world, folder, overwrite, STATE_SPACE, scene=loaded)
     profile = Profile()
+    loaded = on_root(world, under_law_of, loaded, design)
     partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, profile))
     model = linearised_machine(loaded, partition, arms, x_phys, instant, profile, below=below)

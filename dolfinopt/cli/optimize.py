@@ -164,7 +164,7 @@ def simulate(
     tell_assumed(world, loaded)
     folder = out or Path("results") / f"{scene.stem}-simulation"
     from dolfinopt.optimization.result import simulation_result
-    from dolfinopt.output.design import arms_with_design
+    from dolfinopt.output.design import arms_with_design, under_law_of
     from dolfinopt.output.folders import check_unused, remove_stale, working_alone
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
@@ -173,6 +173,7 @@ def simulate(
 
     claim(world, folder, overwrite, scene=loaded)
     profile = Profile()
+    loaded = on_root(world, under_law_of, loaded, design)
     partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
     with working_alone(world, folder, None if overwrite else partial(check_unused, folder)):
         choice = choose_coordinates(loaded, partition, arms, x_phys, profile)
@@ -225,7 +226,8 @@ def gradient(
     world, loaded = load(scene, overrides)
     loaded.check_designed()
     from dolfinopt.optimization.gradient_check import check_exact
-    from dolfinopt.output.design import arms_with_design, write_gradient
+    from dolfinopt.output.design import arms_with_design, under_law_of, write_gradient
+    from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.evaluation import evaluate
     from dolfinopt.responses.evaluation import gradient as slopes
@@ -236,6 +238,7 @@ def gradient(
     if check:
         check_exact(loaded)
     profile = Profile()
+    loaded = on_root(world, under_law_of, loaded, design)
     partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
     prepare(world, out.parent)
     moves = needs(loaded, "motion")

@@ -23,10 +23,10 @@ from dolfinopt.dynamics.feed_forward import (
 )
 from dolfinopt.dynamics.linearised import Linearised, linearised
 from dolfinopt.dynamics.machine_system import MachineSystem, Names
-from dolfinopt.dynamics.measured import FILE_ROUNDING, KEPT_INSTANTS_LIMIT
+from dolfinopt.dynamics.measured import FILE_ROUNDING, KEPT_INSTANTS_LIMIT, LAW_DIFFERENCE
 from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.dynamics.state_space import StateSpace, freed_rates, linear_model
-from dolfinopt.dynamics.tables import LoadedMotion, Table, read_forces
+from dolfinopt.dynamics.tables import LoadedMotion, Table, read_forces, stage_instants
 from dolfinopt.dynamics.trajectory import MachineTrajectory
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.motion.build import (
@@ -48,6 +48,7 @@ from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.duration import file_stamp
+from dolfinopt.scene.law_variables import law_bounds, law_names, law_values, with_law
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import place_of
 from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Control, Force
@@ -319,6 +320,51 @@ class Trajectory(MachineTrajectory):
             found |= (t >= begin - rounding) & (t <= end + rounding)
         found[-1] = True
         return found
+
+    def under_law(self, values: np.ndarray) -> Self:
+        """Return the same motion of the unknowns under another law, see `with_law`.
+
+        With a duration k times as long rates are 1 / k, accelerations 1 / k^2 times as large.
+        """
+        scene, one = with_law(self.scene, values), self.solution
+        k = scene.motion.duration / self.scene.motion.duration
+        solution = replace(one, time_grid=k * one.time_grid, qd=one.qd / k, a=one.a / k**2)
+        problem = build_system(scene, list(self.mechanism.arms))
+        t = k * self.t
+        return replace(self, problem=problem, scene=scene, solution=solution, t=t, scenarios=())
+
+    @cached_property
+    def residual(self) -> np.ndarray:
+        """What the equations leave at all stages (n s, S)."""
+        one = self.solution
+        t = stage_instants(one.time_grid, one.nodes)
+        rates = (one.sample(t, k) for k in range(3))
+        return self.problem.at_stages(one.time_grid, one.nodes).residual(*rates)
+
+    @cached_property
+    def beside(self) -> tuple[tuple[float, Self, Self], ...]:
+        """A step of every variable of the law, and the motion with so much more and less of it."""
+        here, found = law_values(self.scene), []
+        for size, one in zip(np.diff(law_bounds(self.scene), axis=0)[0], np.eye(len(here))):
+            step = LAW_DIFFERENCE * float(size)
+            sides = self.under_law(here + step * one), self.under_law(here - step * one)
+            found.append((step, *sides))
+        return tuple(found)
+
+    def by_law(self, multipliers: np.ndarray, value: Callable[[Self], float]) -> np.ndarray | None:
+        """Return dJ by the variables of the law (n,), by central differences of J and residual.
+
+        dJ/dp = dJ~/dp + sum lambda . dr~/dp, J~ and r~ of the unknowns as `under_law` moves them:
+        the multipliers follow what they really do.
+        """
+        if not law_names(self.scene):
+            return None
+
+        def lagrangian(one: Self) -> float:
+            return value(one) + float(np.vdot(multipliers, one.residual))
+
+        changes = ((lagrangian(a) - lagrangian(b)) / (2.0 * step) for step, a, b in self.beside)
+        return np.array(list(changes))
 
 
 def simulate(

@@ -102,3 +102,7 @@ JOINT_DIFFERENCE = 1e-3  # rad, m, of the joints, by which these are differences
 FORCE_INTERVAL = 1e-3  # s, between the known forces of a control
 SINGULAR_TIP = 1e-3  # least singular value of the tip's Jacobian, over the reach
 TIP_INSTANTS = 121  # at which it is looked at
+
+# -- law -------------------------------------------------------------------------------------
+
+LAW_DIFFERENCE = 1e-5  # of a variable's range: central differences err by 1e-9 of the derivative

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -56,10 +57,12 @@ class Followed:
     Attributes:
         bodies: by every body, corrections of joints held.
         by_coefficients: (p, F) by these corrections; None without.
+        by_law: (n,) by the variables of the motion's law; None without.
     """
 
     bodies: list[ShapeIntegrals]
     by_coefficients: np.ndarray | None = None
+    by_law: np.ndarray | None = None
 
     def through(self, feed_forward: FeedForward | None) -> list[ShapeIntegrals]:
         """Return the derivatives by every body, these corrections following them."""
@@ -289,21 +292,32 @@ class MachineTrajectory:
         """What the drives are asked for at the instants: the desired ones and their corrections."""
         return self.problem.motion(self.t)
 
+    def by_law(self, multipliers: np.ndarray, value: Callable[[Self], float]) -> np.ndarray | None:
+        """Return dJ by the variables of the law; None of a motion whose law is none."""
+        return None
+
     def followed(
-        self, t: np.ndarray, by_rates: np.ndarray, by_motion: np.ndarray | None = None
+        self,
+        t: np.ndarray,
+        by_rates: np.ndarray,
+        by_motion: np.ndarray | None = None,
+        value: Callable[[Self], float] | None = None,
     ) -> Followed:
-        """Return how J follows the bodies through this motion, and the corrections of its joints.
+        """Return how J follows bodies, law, and corrections of the joints through this motion.
 
         Args:
             t: (m,) ascending instants at which J looks at the motion, s.
             by_rates: (m, S) dJ by the unknowns, or (3, m, S) by them and their rates.
             by_motion: (3, m, R) dJ by rigid coordinates and their rates, unknowns held; needed with
                 feed-forward alone.
+            value: J, or the part of it that the bodies do not hold, of the same unknowns under
+                another law; needed with variables of the law alone.
         """
         multipliers = self.adjoint.multipliers(t, by_rates)
         bodies = self.adjoint.by_bodies(*multipliers)
         if self.feed_forward is None:
-            return Followed(bodies)
+            by_law = None if value is None else self.by_law(multipliers[0], value)
+            return Followed(bodies, by_law=by_law)
         if by_motion is None:
             by_motion = np.zeros((3, len(t), self.mechanism.num_rigid))
         corrections = self.feed_forward.corrections

@@ -18,6 +18,7 @@ from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
 from dolfinopt.responses.response import CellGradient
+from dolfinopt.scene.law_variables import LAW, with_law
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -32,7 +33,8 @@ class Evaluator:
     """Evaluates one x after the other, each with the last one's motion as its initial guess.
 
     Attributes:
-        scene, partition, arms, profile: of the run.
+        scene, partition, arms, profile: of the run; the scene with the law of the last x.
+        stated: the scene as it was given.
         variables, projection, patterns: how x makes designs.
         trajectory: of the design evaluated last; None without a motion and off the root.
         solutions: its motions; the next evaluation sets out from them.
@@ -43,7 +45,7 @@ class Evaluator:
         self, scene: Scene, partition: Partition, arms: Mapping[int, Arm], profile: Profile
     ):
         self.scene, self.partition, self.arms, self.profile = scene, partition, arms, profile
-        self.variables = Variables(scene, partition, arms)
+        self.stated, self.variables = scene, Variables(scene, partition, arms)
         self.projection, self.patterns = Projection(scene), Patterns(scene, partition, arms)
         self.trajectory: Trajectory | None = None
         self.solutions: tuple[Solution, ...] = ()
@@ -52,9 +54,11 @@ class Evaluator:
     def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
         """Return what x stands for: eroded, dilated and nominal design, or the nominal one alone.
 
-        Collective; of this rank's arms.
+        Collective; of this rank's arms. From now on the scene has the law of x.
         """
         parts, arms, beta = self.variables.split(x), self.variables.arms, self.projection.beta
+        motion = with_law(self.stated, self.variables.law_of(x)).motion
+        self.scene = self.scene.unchecked_copy({"motion": motion})
         with together(self.partition.world):
             designs = {k: arm.physical_designs(parts[k], beta) for k, arm in arms.items()}
         count = 3 if self.scene.design.projection == "robust" else 1
@@ -163,8 +167,14 @@ class Evaluator:
         self, design: Mapping[int, PhysicalDesign], by_cells: Sequence[CellGradient]
     ) -> np.ndarray:
         """Return gradients (k, n) by x from those by the physical densities (collective)."""
-        by_cells = [self.patterns.collect(one) for one in by_cells]
-        backward = {}
+        low, high = self.variables.law_bounds
+        if self.scene.objective.gradient == "esl":  # frozen loads say nothing of the law: it stays
+            high = low
+        by_law = [(high - low) * one.get(LAW, 0.0) for one in by_cells]
+        by_cells = [
+            self.patterns.collect({k: x for k, x in one.items() if k != LAW}) for one in by_cells
+        ]
+        backward = {LAW: np.array(by_law).T}
         with together(self.partition.world):
             for k, arm in self.variables.arms.items():
                 none = np.zeros(arm.mesh.num_cells)

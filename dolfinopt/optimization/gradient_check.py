@@ -19,6 +19,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS
 from dolfinopt.responses.motion import MotionResponse, motions_of
 from dolfinopt.responses.response import needs, objective_of
+from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -89,7 +90,8 @@ def taylor_test(
     """
     check_exact(scene)
     chain = Evaluator(scene, partition, arms, profile).with_gradient("exact")
-    given = chain.variables.join({k: x[k] for k in chain.variables.arms})
+    begun = chain.variables.split(chain.variables.initial)
+    given = chain.variables.join(begun | {k: x[k] for k in chain.variables.arms})
     inside = INSIDE_MARGIN + (1.0 - 2.0 * INSIDE_MARGIN) * given
     design = chain.physical_designs(inside)[-1]
     chain.evaluate_densities(densities(design))
@@ -101,7 +103,7 @@ def taylor_test(
     value = _fixed_objective(chain)
     here, rows = value(inside), []
     for name, parts in _directions(chain.variables.arms).items():
-        d = chain.variables.join(parts)
+        d = chain.variables.join({LAW: np.ones(len(given) - chain.variables.size)} | parts)
         along = float(slope @ d)
         remainders = tuple(abs(value(inside + h * d) - here - h * along) for h in STEPS)
         rate = _rate(remainders, ROUNDING_SHARE * abs(here))

@@ -117,7 +117,8 @@ class _Run:
         variables = evaluator.variables
         initial = variables.initial
         if x0 is not None:
-            initial = variables.join({k: x0[k] for k in variables.arms})
+            given = {k: x0[k] for k in variables.arms}
+            initial = variables.join(variables.split(initial) | given)
         x = np.clip(initial, variables.xmin, variables.xmax)
         self.iterate = Iterate(evaluator, x)
         self.history: list[HistoryRow] = []  # rows so far (root only)
@@ -246,7 +247,7 @@ class _Run:
         best = one.best.iteration
         returned = "" if best in (-1, one.iteration) else f"returned: iteration {best}"
         return RankResult(
-            scene=self.scene,
+            scene=self.evaluator.scene,
             partition=self.partition,
             arms=self.arms,
             x_phys=x_phys,

@@ -165,7 +165,7 @@ class Memory:
         reach, returned_to: factor on the move limit, and the design that was gone back to last.
         mma_steps: taken since the asymptotes began.
         gradient: in use, "exact" or "esl".
-        cells: per arm (n_cells, k): the design variables and what MMA remembers of them.
+        cells: per arm (n_cells, k), and of the law: the variables and what MMA remembers of them.
         modes: per arm the eigenvectors (owned rows, k) from which this design's reduction and its
             loaded modes set out; k = 0 when they began from nothing.
         multipliers: MMA's, on all ranks.

@@ -1,4 +1,4 @@
-"""The design variables of all arms as one vector."""
+"""The design variables of all arms, and of the motion's law, as one vector."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dolfinopt.parallel import Partition, gather_cells, on_all_ranks
+from dolfinopt.scene.law_variables import LAW, law_bounds, law_values
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -18,13 +19,15 @@ if TYPE_CHECKING:
 class Variables:
     """The design variables as one vector, the same on all ranks, arms one behind the other.
 
-    Arms that repeat another's design have none.
+    Arms that repeat another's design have none. Those of the motion's law are the last ones, from 0
+    to 1 between their bounds.
 
     Attributes:
-        size: n, their number.
+        size: n, the number of cells.
         xmin, xmax: (n,) bounds; equal where a cell stays solid or void.
         initial: (n,) of the design to begin with, whatever the bounds.
         arms: this rank's arms that have variables.
+        law_bounds: least and largest values (n,) of the law's variables.
     """
 
     def __init__(self, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
@@ -39,16 +42,35 @@ class Variables:
         self.size: int = ends[-1]
         self._parts = {k: slice(first[k], first[k] + size) for k, size in sizes.items()}
         meshes = {k: arm.mesh for k, arm in self.arms.items()}
-        least = scene.design.minimum
-        self.xmin = self.join({k: m.keep(np.full(sizes[k], least)) for k, m in meshes.items()})
-        self.xmax = self.join({k: m.keep(np.ones(sizes[k])) for k, m in meshes.items()})
-        self.initial = self.join({k: np.full(sizes[k], scene.initial(k)) for k in meshes})
+        least, (low, high) = scene.design.minimum, law_bounds(scene)
+        self.law_bounds = low, high
+        none, all_of_it = np.zeros(len(low)), np.ones(len(low))
+        self.xmin = self.join(
+            {k: m.keep(np.full(sizes[k], least)) for k, m in meshes.items()} | {LAW: none}
+        )
+        self.xmax = self.join(
+            {k: m.keep(np.ones(sizes[k])) for k, m in meshes.items()} | {LAW: all_of_it}
+        )
+        start = (law_values(scene) - low) / (high - low)
+        self.initial = self.join(
+            {k: np.full(sizes[k], scene.initial(k)) for k in meshes} | {LAW: start}
+        )
 
     def split(self, x: np.ndarray) -> dict[int, np.ndarray]:
-        """Return the parts of this rank's arms."""
-        return {k: x[part] for k, part in self._parts.items()}
+        """Return the parts of this rank's arms, and under `LAW` the law's."""
+        return {k: x[part] for k, part in self._parts.items()} | {LAW: x[self.size :]}
 
     def join(self, parts: Mapping[int, np.ndarray]) -> np.ndarray:
-        """Return the parts of all ranks as one array (n, ...) (collective)."""
-        every = self.partition.world.bcast(gather_cells(self.partition, parts), root=0)
-        return np.concatenate(list(every.values()))
+        """Return the parts of all ranks as one array (n, ...) (collective).
+
+        The law's, which all ranks have, may be missing where it has no variables.
+        """
+        cells = {k: one for k, one in parts.items() if k != LAW}
+        every = self.partition.world.bcast(gather_cells(self.partition, cells), root=0)
+        law = [parts[LAW]] if LAW in parts else []
+        return np.concatenate([*every.values(), *law])
+
+    def law_of(self, x: np.ndarray) -> np.ndarray:
+        """Return the values of the law's variables: shares of the way, s."""
+        low, high = self.law_bounds
+        return np.asarray(low + (high - low) * x[self.size :])

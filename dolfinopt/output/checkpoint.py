@@ -18,6 +18,7 @@ from dolfinopt.optimization.state import Best, HistoryRow, Memory, Progress
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
+from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import DIGEST, program, with_digests
 from dolfinopt.solver import user_options
@@ -238,7 +239,7 @@ def arrays_of(
         ]
     columns: dict[str, Mapping[int, Any]] = {
         "centroid": gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()}),
-        "cells": gather_cells(partition, memory.cells),
+        "cells": gather_cells(partition, {k: x for k, x in memory.cells.items() if k != LAW}),
         "points": gather_cells(partition, points),
     }
     for j, by_arm in enumerate(known):
@@ -257,6 +258,7 @@ def arrays_of(
         "since": memory.progress.since,
         "best": [getattr(memory.best, name) for name in BEST],
         "sharpness": memory.beta,
+        "law": memory.cells[LAW],
     }
     for k, solution in enumerate(memory.solutions):
         for name, field in (*SOLUTION.items(), ("error", "error")):
@@ -269,7 +271,7 @@ def arrays_of(
 
 def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str, Any]:
     """Return the fields of `Memory`."""
-    cells: dict[int, np.ndarray] = {}
+    cells = {LAW: np.asarray(arrays["law"])}
     modes: dict[int, list[np.ndarray]] = {}
     for k, arm in arms.items():
         if f"arm{k}/cells" in arrays:  # an arm that repeats another's design has no variables

@@ -23,6 +23,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
+from dolfinopt.scene.law_variables import LAW, law_names, law_values, with_law
 from dolfinopt.scene.load import Arm as ArmKeys
 from dolfinopt.scene.load import Arm as SceneArm
 from dolfinopt.scene.load import Scene
@@ -242,16 +243,16 @@ def designed(views: Sequence[ArmView]) -> list[ArmView]:
 # -- design.npz and gradient.npz: values of the cells by centroid, and reading a design back ------
 
 # Of the arrays of design.npz.
-UNITS = {"centroid": "m", "density": "-", "filtered": "-"}
+UNITS = {"centroid": "m", "density": "-", "filtered": "-", "shape": "-", "duration": "s"}
 ROUNDING = 1e-9  # of densities that other programs have computed
 
 
-def write_design(folder: Path, views: Sequence[ArmView]) -> None:
-    """Write design.npz: centroids and physical densities of every arm.
+def write_design(folder: Path, views: Sequence[ArmView], scene: Scene) -> None:
+    """Write design.npz: centroids and physical densities of every arm, and a designed law.
 
     Of projected designs what they were projected from, too: outlines are drawn by it.
     """
-    arrays = {}
+    arrays = by_law_name(scene, law_values(scene))
     for view in designed(views):
         arrays[f"{view.name}/centroid"] = view.centroid
         arrays[f"{view.name}/density"] = view.density
@@ -276,18 +277,40 @@ def write_gradient(
     design each arm's own, which add up cell by cell.
     """
     centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
-    gathered = gather_cells(partition, by_cell)
+    by_law = by_law_name(scene, by_cell.get(LAW, np.zeros(0)))
+    gathered = gather_cells(partition, {k: x for k, x in by_cell.items() if k != LAW})
     with together(partition.world):
         if partition.world.rank != 0:
             return
-        arrays: dict[str, Any] = {"objective": objective}
+        arrays: dict[str, Any] = {"objective": objective, **by_law}
         for index, centroid in centroids.items():
             order, name = canonical_order(centroid), scene.arms[index].name
             arrays[f"{name}/centroid"] = centroid[order]
-            arrays[f"{name}/gradient"] = gathered[index][order]
+            arrays[f"{name}/gradient"] = gathered.get(index, np.zeros(len(order)))[order]
         unit = scene.objective.response.unit  # per physical density, which has none
         arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
         write_arrays(path, arrays)
+
+
+def by_law_name(scene: Scene, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return values (n,) of the law's variables under their names in files."""
+    count = len(scene.motion.coefficients)
+    found = {"motion/shape": values[:count], "motion/duration": values[count:]}
+    return {name: one for name, one in found.items() if len(one)}
+
+
+def under_law_of(scene: Scene, design: Path | None) -> Scene:
+    """Return a scene with the law of a design.npz, where the scene's law has variables."""
+    if design is None or not law_names(scene):
+        return scene
+    arrays, here = _load_design(design), by_law_name(scene, law_values(scene))
+    values = [np.ravel(arrays.get(name, one)) for name, one in here.items()]
+    if [len(one) for one in values] != [len(one) for one in here.values()]:
+        raise InputError(
+            f"{design}: motion/shape: {len(values[0])} coefficients, and motion.shape has "
+            f"{len(scene.motion.coefficients)} in {scene.source}; state as many"
+        )
+    return with_law(scene, np.concatenate(values))
 
 
 def read_views(scene: Scene, path: Path) -> list[ArmView]:

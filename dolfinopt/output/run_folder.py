@@ -77,7 +77,7 @@ def write_result(
     with together(one.partition.world):
         if one.trajectory is None:
             return None
-        write_design(folder, views)
+        write_design(folder, views, one.scene)
         if removed := remove_stale_parts(folder):
             summary["warnings"].append(removed)
         if paraview:

@@ -182,7 +182,8 @@ def gradient(
     rows = objective_of(scene).gradients(analysis)
     if len(rows) == 1:
         return rows[0]
-    return {k: np.sum([row[k] for row in rows if k in row], axis=0) for k in arms}
+    owners = {k for row in rows for k in row}
+    return {k: np.sum([row[k] for row in rows if k in row], axis=0) for k in owners}
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.trajectory import ByMotion, Followed
 from dolfinopt.motion.build import CART
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals, integrals_of
+from dolfinopt.multibody.shape_integrals import add_integrals, integrals_of
 from dolfinopt.parallel import on_root, together
 from dolfinopt.responses.response import (
     Analysis,
@@ -30,6 +30,7 @@ from dolfinopt.responses.response import (
     worst_of,
 )
 from dolfinopt.responses.sensitivity import esl_gradient, exact_gradient
+from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene, WorstBy
 from dolfinopt.scene.tables.objective import Objective
 
@@ -147,7 +148,14 @@ class MotionResponse(Response):
         seen = self.seen(trajectory)
         cases = self.load_cases(seen)
         by = self.derivatives(seen, cases)
-        found = trajectory.followed(seen.t[cases.indices], by.unknowns, by.motion)
+
+        def value(moved: Trajectory) -> float:
+            there = self.seen(moved)
+            own = self.load_cases(there)
+            same = np.array_equal(own.indices, cases.indices)
+            return self.value_at(there, own if same else cases)
+
+        found = trajectory.followed(seen.t[cases.indices], by.unknowns, by.motion, value)
         return replace(found, bodies=list(map(add_integrals, found.bodies, by.bodies)))
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
@@ -212,13 +220,14 @@ class MotionResponse(Response):
             with together(world):
                 return {k: esl_gradient(one, moments[k], analysis.by) for k, one in designs.items()}
 
-        def followed() -> dict[int, ShapeIntegrals]:
+        def followed() -> dict[int, Any]:
             weights = self._weights_of_scenarios(analysis.motion)
             return over_motions(analysis, lambda _, one: self.cotangents(one), weights)
 
         by = on_root(world, followed)
         with together(world):
-            return {k: exact_gradient(one, by[k], by=analysis.by) for k, one in designs.items()}
+            own = {k: exact_gradient(one, by[k], by=analysis.by) for k, one in designs.items()}
+        return own | {LAW: by[LAW]} if LAW in by else own
 
     def _weights_of_scenarios(self, trajectory: Trajectory) -> list[float]:
         """Return the derivatives of the value by those of `motions_of`."""
@@ -245,7 +254,7 @@ def over_motions(
     analysis: Analysis,
     of_motion: Callable[[int, Trajectory], Followed | None],
     weights: Sequence[float] = (),
-) -> dict[int, ShapeIntegrals]:
+) -> dict[int, Any]:
     """Differentiate a weighted sum over all motions by the bodies of every design (on the root).
 
     Args:
@@ -255,10 +264,11 @@ def over_motions(
         weights: of the motions; all 1 by default.
 
     Returns:
-        By the bodies of the scene, by the index of the arm that owns the design.
+        By the bodies of the scene, by the index of the arm that owns the design; under `LAW` by the
+        variables of the motion's law (n,), where there are any.
     """
     scene, nominal, profile = analysis.scene, analysis.motion.feed_forward, analysis.profile
-    parts: list[tuple[int, ShapeIntegrals]] = []
+    parts: list[tuple[int, Any]] = []
     by_coefficients: list[np.ndarray] = []
     for number, one in enumerate(motions_of(analysis.motion)):
         with profile.phase("adjoint"):
@@ -271,6 +281,8 @@ def over_motions(
             found = Followed(found.through(one.feed_forward))
         if found.by_coefficients is not None:
             by_coefficients.append(weight * found.by_coefficients)
+        if found.by_law is not None:
+            parts.append((LAW, weight * found.by_law))
         bodies = found.bodies[: len(scene.arms)]
         if one.scene is not scene:
             bodies = [

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from itertools import product
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -37,6 +38,7 @@ from dolfinopt.responses.response import (
     response,
 )
 from dolfinopt.responses.sensitivity import exact_gradient, of_pairs
+from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
 
 # -- von Mises stress at the element centres of one design, relaxed for intermediate density -----
@@ -252,7 +254,14 @@ def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ByLoads])
     t = motion.t[instants]
     by_rates, by_motion, by_bodies = load_gradient(motion.problem, t, (y, yd, ydd), by_c)
     by_rates[0] += motion.by_unknowns(by_q)
-    followed = motion.followed(t, by_rates, by_motion)
+
+    def value(moved: Trajectory) -> float:
+        return sum(
+            float(np.vdot(one.by, _coefficients(scene, moved, one.place)[one.instants]))
+            for one in by_arms
+        )
+
+    followed = motion.followed(t, by_rates, by_motion, value)
     parts = zip(followed.bodies, by_bodies, own, strict=True)
     return replace(followed, bodies=[reduce(add_integrals, more, a + b) for a, b, more in parts])
 
@@ -497,7 +506,7 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
     partition, designs = analysis.partition, analysis.designs
     by_arm = gather_arms(partition, {k: one.by_loads for k, one in mine.items()})
 
-    def followed() -> dict[int, ShapeIntegrals]:
+    def followed() -> dict[int, Any]:
         every = [one for each in by_arm.values() for one in each]
 
         def of_motion(number: int, motion: Trajectory) -> Followed | None:
@@ -506,7 +515,7 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
 
         return over_motions(analysis, of_motion)
 
-    by_body: dict[int, ShapeIntegrals] = on_root(partition.world, followed)
+    by_body: dict[int, Any] = on_root(partition.world, followed)
     row = {}
     with together(partition.world):
         for k, one in mine.items():
@@ -514,7 +523,7 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
             if k in by_body:
                 by.append(exact_gradient(designs[k], by_body[k], one.displaced, analysis.by))
             row[k] = np.sum(by, axis=0)
-    return row
+    return row | {LAW: by_body[LAW]} if LAW in by_body else row
 
 
 # -- the largest of very many lengths |A_e a_n| over points e and instants n, looking at few

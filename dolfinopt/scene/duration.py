@@ -10,7 +10,7 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.scene.csv_table import TIME, column_names, last_instant, read_table
 from dolfinopt.scene.laws import Law as TimeLaw
-from dolfinopt.scene.laws import Limits, law_for
+from dolfinopt.scene.laws import Limits, ShapedLaw, law_for
 from dolfinopt.scene.tables.motion import Motion
 
 POINT = ("x", "y")  # columns of a table of points
@@ -18,7 +18,7 @@ SPACE_POINT = ("x", "y", "z")
 SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ
 
 
-def time_law(motion: Motion) -> TimeLaw:
+def time_law(motion: Motion) -> TimeLaw | ShapedLaw:
     """Return the law by which the scene runs along its path.
 
     Raises:
@@ -28,7 +28,7 @@ def time_law(motion: Motion) -> TimeLaw:
     law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
     if motion.duration < law.least * (1.0 - SAME_TIME):
         raise InputError(f"motion.duration = {motion.duration:g}: {too_short(law)}")
-    return law
+    return ShapedLaw(law, motion.coefficients) if any(motion.coefficients) else law
 
 
 known_law = lru_cache(maxsize=64)(law_for)

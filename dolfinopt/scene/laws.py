@@ -15,10 +15,11 @@ stage begins one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf, sqrt
 
 import numpy as np
-from numpy.polynomial import Polynomial
+from numpy.polynomial import Legendre, Polynomial
 from numpy.polynomial.polynomial import polyder, polyint, polyval
 
 Values = tuple[np.ndarray, np.ndarray, np.ndarray]  # a quantity and two time derivatives, (n, ...)
@@ -83,6 +84,52 @@ class Law:
         turned = u - 0.5 + found[0], 1.0 - found[1], found[2], -found[3]
         values: np.ndarray = np.where(late, turned, found)
         return values
+
+
+@dataclass(frozen=True, eq=False)
+class ShapedLaw:
+    """A time law s(u) + (4 u (1 - u))^3 sum_k c_k P_k(2 u - 1), of Legendre polynomials P_k.
+
+    It begins and ends with the speed and acceleration of s, whatever the coefficients.
+
+    Attributes:
+        base: s.
+        coefficients: (N,) c, shares of the way.
+    """
+
+    base: Law
+    coefficients: tuple[float, ...]
+
+    def __call__(self, t: np.ndarray, duration: float) -> Values:
+        """Return its value and two time derivatives (n,) at instants t (n,), s."""
+        u = t / duration
+        moving = (u > 0.0) & (u < 1.0)  # at the ends it rests exactly
+        s, sd, sdd = (
+            one + moving * self._change.deriv(k)(u) / duration**k
+            for k, one in enumerate(self.base(t, duration))
+        )
+        return s, sd, sdd
+
+    def integral(self, t: np.ndarray, duration: float) -> np.ndarray:
+        """Return the integral of its value over time up to instants t (n,), s."""
+        more = self._change.integ()(np.clip(t / duration, 0.0, 1.0))
+        return self.base.integral(t, duration) + duration * more
+
+    @property
+    def knots(self) -> np.ndarray:
+        """Shares of the duration inside at which its second or third derivative jumps."""
+        return self.base.knots
+
+    @property
+    def least(self) -> float:
+        """Shortest duration, s: limits along the path are none of a shaped law."""
+        return 0.0
+
+    @cached_property
+    def _change(self) -> Polynomial:
+        bump = Polynomial([0.0, 4.0, -4.0]) ** 3
+        waves = Legendre(self.coefficients, domain=[0.0, 1.0]).convert(kind=Polynomial)
+        return bump * waves
 
 
 def law_for(name: str, length: float, limits: Limits, share: float) -> Law:

@@ -37,7 +37,7 @@ from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.optimization.result import RankResult, simulation_result
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output import checkpoint
-from dolfinopt.output.design import arms_with_design, read_history
+from dolfinopt.output.design import arms_with_design, read_history, under_law_of
 from dolfinopt.output.folders import working_alone
 from dolfinopt.output.run_folder import optimize, write_result
 from dolfinopt.output.summary import figures, versions, write_summary
@@ -237,7 +237,8 @@ def simulate_scenarios(
     """
     profile = Profile()
     partition, arms, x_phys = arms_with_design(MPI.COMM_SELF, scenes[0], design, profile)
-    for scene in scenes:
+    for given in scenes:
+        scene = under_law_of(given, design)
         arms = {k: arm.under(scene) for k, arm in arms.items()}
         place = scene, partition, arms, x_phys
         try:

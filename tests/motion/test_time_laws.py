@@ -16,7 +16,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
 from dolfinopt.motion.paths import Curve, curve_by_chord, curve_in_time
 from dolfinopt.scene.csv_table import Table, read_table
-from dolfinopt.scene.laws import Law, Limits, law_for
+from dolfinopt.scene.laws import Law, Limits, ShapedLaw, law_for
 from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -96,6 +96,23 @@ def test_continuity_is_what_the_law_promises(name: str, share: float) -> None:
         assert jumps[2] > 1.0
         left = law(knots[1:], duration)[2]  # at a knot itself: the value before it
         assert_close(left, both[0][2][1:], 1e-12)
+
+
+def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives() -> None:
+    """(4 u (1 - u))^3 leaves place, speed and acceleration at the ends; by Gauss' rule."""
+    law, duration = ShapedLaw(law_of("quintic"), (0.1, -0.2, 0.15)), 0.7
+    ends = law(np.array([0.0, duration]), duration)
+    assert_close(ends[0], [0.0, 1.0], 1e-14)
+    assert_close(np.array(ends[1:]), np.zeros((2, 2)), 1e-12)
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    t = 0.5 * 0.5 * (1.0 + nodes)  # up to 0.5 s
+    there = law(np.array([0.5]), duration)
+    assert_close(
+        law.integral(np.array([0.5]), duration), [0.25 * weights @ law(t, duration)[0]], 1e-13
+    )
+    for order in (0, 1):
+        assert_close(there[order], [0.25 * weights @ law(t, duration)[order + 1]], 1e-13, 1.0)
+    assert abs(law(np.array([0.2]), duration)[0] - law.base(np.array([0.2]), duration)[0]) > 0.01
 
 
 def test_peaks_in_closed_form() -> None:

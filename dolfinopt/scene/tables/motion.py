@@ -31,6 +31,9 @@ Base = Literal["cart", "fixed"]
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
 Gravity = tuple[Acceleration, Acceleration] | tuple[Acceleration, Acceleration, Acceleration]
 Instant = Annotated[float, Field(ge=0, le=1e5)]  # s
+SHAPE_LIMIT = 0.2  # of coefficients: shares of the way by which a law may run ahead
+ShapeCount = Annotated[int, Field(ge=0, le=8)]
+Coefficient = Annotated[float, Field(ge=-SHAPE_LIMIT, le=SHAPE_LIMIT)]
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 
 
@@ -88,6 +91,11 @@ class Motion(Table):
         default="quintic",
         description="time law along the path; for a table with times, of every move between two "
         "stops [-]",
+    )
+    shape: ShapeCount | tuple[Coefficient, ...] = Field(
+        default=0,
+        description="how many coefficients of the law optimize chooses beside the densities, at "
+        "most 8, or their values, shares of the way [-]",
     )
     acceleration_share: float = Field(
         default=0.25,
@@ -203,6 +211,11 @@ class Motion(Table):
             )
 
     @property
+    def coefficients(self) -> tuple[float, ...]:
+        """The coefficients of a shaped law, shares of the way; 0 where none are stated."""
+        return self.shape if isinstance(self.shape, tuple) else (0.0,) * self.shape
+
+    @property
     def stated_dwells(self) -> tuple[tuple[float, float], ...]:
         """The dwells that the scene states, s."""
         return () if isinstance(self.dwells, bool) else self.dwells
@@ -236,6 +249,8 @@ class Motion(Table):
                 ("motion", "horizon"),
                 ("motion", "table_ends"),
             )
+        if self.coefficients or scene.objective.kind == "duration":
+            self._check_designed_law(scene)
         if scene.is_spatial:
             return  # `tables.joints` knows
         for key in ("gravity", "start", "end"):
@@ -278,6 +293,43 @@ class Motion(Table):
                 "of the cart",
                 ("motion", "cart_follow"),
             )
+
+    def _check_designed_law(self, scene: Scene) -> None:
+        """Refuse what a law with variables cannot be combined with."""
+        key = ("motion", "shape") if self.coefficients else ("objective", "kind")
+        if self.path in ("points", "joints"):
+            raise Refusal(
+                'expected "arc", "line" or "rotation": the instants of a table\'s rows would move',
+                ("motion", "path"),
+                key,
+            )
+        for limit in ("max_speed", "max_acceleration", "max_jerk"):
+            if getattr(self, limit) is not None:
+                raise Refusal(
+                    "expected none: no limit along the path bounds a law with variables; limit "
+                    "what the drives do, constraints.effort or peak_force",
+                    ("motion", limit),
+                    key,
+                )
+        if scene.feed_forward.on:
+            raise Refusal(
+                'expected "none": corrections of joints do not follow a law with variables',
+                ("feed_forward", "kind"),
+                key,
+            )
+        if scene.objective.gradient != "exact":
+            raise Refusal(
+                'expected "exact": frozen loads say nothing of the law',
+                ("objective", "gradient"),
+                key,
+            )
+        for k, one in enumerate(scene.scenarios):
+            if any(change.lstrip().startswith("motion.") for change in one.changes):
+                raise Refusal(
+                    "expected no changes of the motion, whose law has variables",
+                    ("scenarios", k, "changes"),
+                    key,
+                )
 
 
 # -- `[simulation]` ------------------------------------------------------------------------------

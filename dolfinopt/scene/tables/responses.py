@@ -344,6 +344,14 @@ DECLARED: dict[str, Declaration] = {
             file="poles",
         ),
         Declaration(
+            "duration",
+            "duration of the motion",
+            "s",
+            exact=True,
+            of_nominal=True,
+            file="duration",
+        ),
+        Declaration(
             "static",
             "compliance under static loads",
             "N m",
