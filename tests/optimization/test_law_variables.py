@@ -107,9 +107,29 @@ def test_run_is_resumed_in_the_same_bits_and_its_design_read_with_its_law(tmp_pa
     [
         (["feed_forward.kind=tip"], "feed_forward.kind"),
         (["objective.gradient=esl"], "objective.gradient"),
-        (["motion.max_speed=3"], "motion.max_speed"),
+        (["motion.max_speed=30"], "constraints.path_speed"),
     ],
 )
 def test_what_a_designed_law_cannot_be_combined_with(changes: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
         quick("motion.shape=2", "objective.gradient=exact", *changes)
+
+
+def test_rates_along_the_path() -> None:
+    """Of the quintic law in closed form; their gradients by differences."""
+    limits = "path_speed", "path_acceleration", "path_jerk"
+    chain = evaluator_of(
+        "objective.kind=duration", "motion.shape=[0.0,0.0]",
+        *(f"constraints.{one}=1" for one in limits),
+    )  # fmt: skip
+    x, T = chain.variables.initial, chain.scene.motion.duration
+    here = chain.evaluate(x)[-1]
+    found = [one.values[0] for one in here.evaluation.responses[-3:]]
+    peaks = np.pi * np.array([15 / 8 / T, 10 / np.sqrt(3) / T**2, 60 / T**3])
+    assert found == pytest.approx(peaks, rel=0.02)  # of the jerk means between samples
+    assert found[:2] == pytest.approx(peaks[:2], rel=1e-4)
+    for k in range(chain.variables.size, len(x)):
+        step = 1e-5 * (np.arange(len(x)) == k)
+        a, b = (smooth_of(chain.tried(x + sign * step)[-1].evaluation) for sign in (1.0, -1.0))
+        expected = (a - b) / 2e-5 / np.array(here.evaluation.smooth_limits)
+        assert here.constraints[-3:, k] == pytest.approx(expected[-3:], rel=1e-6, abs=1e-8)

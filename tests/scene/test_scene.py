@@ -341,6 +341,8 @@ BAD_VALUES = [
     ("constraints.settling_after", [1.2], "at most 1.1 [s], from motion.duration = 1.9"),
     ("motion.horizon", [1.0], "at least motion.duration = 1.9 [s]"),
     ("motion.acceleration_share", [0.3], '0.25, the default, with motion.law = "quintic"'),
+    ("constraints.path_speed constraints.path_acceleration constraints.path_jerk", [0.0, "fast"],
+     "a number >= 1e-06 and <= 1e+12"),
     ("motion.shape", [9, -1, [0.3], "wavy"], "an integer >= 0 and <= 8 | an array of numbers"),
     ("motion.max_speed motion.max_acceleration motion.max_jerk", [0.0, -1.0, "fast"],
      "a number >= 1e-06 and <= 1e+12"),

@@ -37,6 +37,9 @@ Coefficient = Annotated[float, Field(ge=-SHAPE_LIMIT, le=SHAPE_LIMIT)]
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 
 
+OF_PATH = "path_speed", "path_acceleration", "path_jerk"  # limits of a law with variables
+
+
 class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
 
@@ -251,6 +254,14 @@ class Motion(Table):
             )
         if self.coefficients or scene.objective.kind == "duration":
             self._check_designed_law(scene)
+        else:
+            for key in OF_PATH:
+                if key in scene.constraints.limits:
+                    raise Refusal(
+                        "expected none without variables of the law (motion.shape): limit a given "
+                        f"law by motion.max_{key[5:]}",
+                        ("constraints", key),
+                    )
         if scene.is_spatial:
             return  # `tables.joints` knows
         for key in ("gravity", "start", "end"):
@@ -297,18 +308,19 @@ class Motion(Table):
     def _check_designed_law(self, scene: Scene) -> None:
         """Refuse what a law with variables cannot be combined with."""
         key = ("motion", "shape") if self.coefficients else ("objective", "kind")
-        if self.path in ("points", "joints"):
+        rates = any(one in scene.constraints.limits for one in OF_PATH)
+        if self.path in ("points", "joints") or (rates and self.path == "rotation"):
             raise Refusal(
-                'expected "arc", "line" or "rotation": the instants of a table\'s rows would move',
+                'expected "arc" or "line", or "rotation" without limits along the path: the '
+                "instants of a table's rows would move",
                 ("motion", "path"),
                 key,
             )
-        for limit in ("max_speed", "max_acceleration", "max_jerk"):
-            if getattr(self, limit) is not None:
+        for limit in OF_PATH:
+            if getattr(self, f"max_{limit[5:]}") is not None:
                 raise Refusal(
-                    "expected none: no limit along the path bounds a law with variables; limit "
-                    "what the drives do, constraints.effort or peak_force",
-                    ("motion", limit),
+                    f"expected none: limit a law with variables by constraints.{limit}",
+                    ("motion", f"max_{limit[5:]}"),
                     key,
                 )
         if scene.feed_forward.on:

@@ -39,6 +39,7 @@ Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
 Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
 Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
 Factor = Annotated[float, Field(ge=1e-3, le=1e3)]  # -
+Rate = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3
 Ratio = Annotated[float, Field(ge=-0.99, le=0.99)]  # -
 Component = Annotated[float, Field(ge=-LARGEST_LOAD, le=LARGEST_LOAD)]  # N, N m
 
@@ -347,9 +348,28 @@ DECLARED: dict[str, Declaration] = {
             "duration",
             "duration of the motion",
             "s",
+            frozenset(),
             exact=True,
             of_nominal=True,
-            file="duration",
+            file="law",
+        ),
+        *(
+            Declaration(
+                f"path_{what}",
+                f"largest {what} along the path",
+                unit,
+                frozenset(),
+                Limited(
+                    f"upper limit of the {what} along the path of a law with variables, see "
+                    f"motion.shape [{unit}]",
+                    Rate,
+                ),
+                objective=False,
+                exact=True,
+                of_nominal=True,
+                file="law",
+            )
+            for what, unit in (("speed", "m/s"), ("acceleration", "m/s2"), ("jerk", "m/s3"))
         ),
         Declaration(
             "static",
