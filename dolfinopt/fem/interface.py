@@ -11,13 +11,13 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 from dolfinx import fem
 from mpi4py import MPI
-from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
@@ -440,40 +440,7 @@ def _is_stiffness(matrix: np.ndarray) -> bool:
     return True
 
 
-# -- solid cells that only far softer ones connect to an arm's interfaces ------------------------
-
-
 def extremes(comm: MPI.Comm, values: np.ndarray) -> tuple[float, float]:
     """Return the least and the largest of positive values on all ranks."""
     low = comm.allreduce(values.min(initial=np.inf), op=MPI.MIN)
     return low, comm.allreduce(values.max(initial=0.0), op=MPI.MAX)
-
-
-def joins(
-    comm: MPI.Comm,
-    space: Any,
-    cells: np.ndarray,
-    interfaces: list[np.ndarray],
-    solid: np.ndarray,
-) -> bool:
-    """Return whether solid cells that share nodes lead from the first interface to all others.
-
-    Collective on `comm`, the same on all ranks.
-
-    Args:
-        comm, space, cells, interfaces: as of `Connectivity`.
-        solid: (n_cells,) True for the owned cells that count.
-    """
-    number = space.dofmap.index_map.local_to_global
-    nodes = number(cells[solid].ravel().astype(np.int32)).reshape(-1, cells.shape[1])
-    nodes = np.concatenate(comm.allgather(nodes))
-    ends = [
-        np.concatenate(comm.allgather(number(np.flatnonzero(mask).astype(np.int32))))
-        for mask in interfaces
-    ]
-    first, second = np.repeat(nodes[:, 0], nodes.shape[1]), nodes.ravel()
-    size = space.dofmap.index_map.size_global
-    graph = sp.coo_matrix((np.ones(first.size), (first, second)), shape=(size, size))
-    _, group = connected_components(graph, directed=False)
-    at = [group[np.intersect1d(end, second)] for end in ends]
-    return all(np.intersect1d(at[0], other).size for other in at[1:])
