@@ -13,12 +13,11 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from dolfinopt.mesh.checks import edge_corners
+
 WORST = 3  # contacts whose places are told
 ROUNDS = 20  # of opening contacts: a cell that is taken away may leave another contact
 MANY = 1000  # contacts, of a chequerboard say, beyond which none is opened
-# Edges of a cell in space by its corners, in the order of the finite elements.
-TETRAHEDRON = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
-HEXAHEDRON = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ class _Solid:
         self.rigid[nodes[held > 0]] = True
         self.edges = np.zeros((n, 0), dtype=int)
         if d == 3:
-            first, second = nodes[:, TETRAHEDRON if k == 4 else HEXAHEDRON].transpose(2, 0, 1)
+            first, second = nodes[:, edge_corners(d, k)].transpose(2, 0, 1)
             self.edges = np.minimum(first, second) * len(points) + np.maximum(first, second)
 
     def pieces(self, kept: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import combinations
 from pathlib import Path
 
 import basix
@@ -248,6 +247,11 @@ def facet_corners(dim: int, corners: int) -> list[list[int]]:
     return facets
 
 
+def edge_corners(dim: int, corners: int) -> np.ndarray:
+    """Return the corners (e, 2) of every edge of a cell of dimension `dim`."""
+    return np.array(basix.topology(KINDS[dim, corners])[1])
+
+
 def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
     """Return the lengths (m,) of all edges of cells of dimension `dim`, in DOLFINx's corner order.
 
@@ -255,11 +259,7 @@ def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
         dim: 2 or 3.
         corners: (n, corners, d) m.
     """
-    count = corners.shape[1]
-    pairs = list(combinations(range(count), 2))
-    if count != dim + 1:  # corners of a tensor product differ in one bit along an edge
-        pairs = [(i, j) for i, j in pairs if (i ^ j).bit_count() == 1]
-    first, second = np.array(pairs).T
+    first, second = edge_corners(dim, corners.shape[1]).T
     return np.linalg.norm(corners[:, first] - corners[:, second], axis=2).ravel()
 
 

@@ -29,6 +29,7 @@ from dolfinopt.mesh.gmsh_session import (
     mesh_surfaces,
     mesh_volumes,
     silent_terminal,
+    telling,
 )
 from dolfinopt.mesh.inp import read_inp
 from dolfinopt.mesh.measured import FILE_ROUNDING_SHARE
@@ -67,14 +68,10 @@ def where_of(arm: Arm) -> str:
 def telling_where(where: str) -> Iterator[None]:
     """Put file and arm before what is wrong with them, and before what Gmsh says."""
     try:
-        yield
+        with telling(lambda text: InputError(f"{text}; open the file in Gmsh to repair it")):
+            yield
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    except Exception as error:
-        if type(error) is not Exception:  # Gmsh raises no other
-            raise
-        text = " ".join(str(error).split()) or "Gmsh failed"
-        raise InputError(f"{where}: {text}; open the file in Gmsh to repair it") from None
 
 
 def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
