@@ -18,12 +18,12 @@ from dolfinopt.reduction.basis import (
     Expansion,
     InverseSpace,
     Options,
+    basis_of,
     dot,
     frame_fields,
     frame_loads,
     interface_loads,
     interior_rows,
-    orient,
     orthonormalise,
     ritz,
     solve_at,
@@ -50,7 +50,6 @@ def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = 
         options: coordinates q >= b; with q = b no eigenproblem is solved.
         start: `Basis.start` of a nearby design, or None.
     """
-    arm.profile.counts.reductions += 1
     static = arm.constraint_modes()
     b = len(static.stiffness)
     normal = options.coordinates - b
@@ -58,24 +57,14 @@ def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = 
     if normal > 0:
         _, modes = lowest_eigenpairs(Pencil(arm), normal, start)
     outboard = np.hstack([np.eye(b), np.zeros((b, normal))])
-    V = arm.expand(np.hstack([static.interior, modes]), outboard)
-    MV = arm.mass_times(V)
-    sign = np.ones(options.coordinates)
-    sign[b:] = orient(arm, V[:, :, b:], MV[:, :, b:])
-    # Constraint and normal modes are K-orthogonal, normal modes among themselves, too.
-    stiffness = np.zeros((options.coordinates, options.coordinates))
-    stiffness[:b, :b] = static.stiffness
-    if normal > 0:
-        stiffness[b:, b:] = np.diag(np.diag(arm.energy_matrix(V[:, :, b:])))
-    return Basis(V * sign, MV * sign, stiffness, outboard, modes * sign[b:])
+    return basis_of(arm, (np.hstack([static.interior, modes]), outboard), modes, static.stiffness)
 
 
 def craig_bampton_adjoint(
     arm: ElasticArm,
     basis: Basis,
     options: Options,
-    interior: np.ndarray,
-    outboard: np.ndarray,
+    cotangents: Rows,
 ) -> AdjointFields:
     """Return mu and lambda mu with d(cotangents . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
 
@@ -84,10 +73,9 @@ def craig_bampton_adjoint(
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (b, q) cotangents of its outboard rows; without effect here.
+        cotangents: (.., q) of the rows of V; those of the outboard ones have no effect here.
     """
-    b = len(basis.outboard)
+    (interior, outboard), b = cotangents, len(basis.outboard)
     mu = arm.solve(interior[:, :b])
     values = np.concatenate([np.zeros(b), np.diag(basis.stiffness)[b:]])
     if interior.shape[1] > b:
@@ -108,33 +96,25 @@ def modal(arm: ElasticArm, options: Options, start: np.ndarray | None = None) ->
         options: coordinates q >= 1.
         start: `Basis.start` of a nearby design, or None.
     """
-    arm.profile.counts.reductions += 1
     pencil = Pencil(arm, is_free=True)
     _, vectors = lowest_eigenpairs(pencil, options.coordinates, start)
-    interior, outboard = pencil.split(vectors)
-    V = arm.expand(interior, outboard)
-    MV = arm.mass_times(V)
-    sign = orient(arm, V, MV)
-    stiffness = np.diag(np.diag(arm.energy_matrix(V)))
-    return Basis(V * sign, MV * sign, stiffness, outboard * sign, vectors * sign)
+    return basis_of(arm, pencil.split(vectors), vectors)
 
 
 def modal_adjoint(
     arm: ElasticArm,
     basis: Basis,
     options: Options,
-    interior: np.ndarray,
-    outboard: np.ndarray,
+    cotangents: Rows,
 ) -> AdjointFields:
     """Return mu and lambda mu with d(cotangents . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (b, q) cotangents of its outboard rows.
+        cotangents: (.., q) of the rows of V.
     """
     pencil, values = Pencil(arm, is_free=True), np.diag(basis.stiffness)
-    right = pencil.joined(interior, outboard)
+    right = pencil.joined(*cotangents)
     field = pencil.field(complement_solve(pencil, basis.start, values, right))
     return AdjointFields(field, field * values)
 
@@ -165,7 +145,6 @@ def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -
     Raises:
         ConvergenceError: fewer than q independent vectors, or a shift at a natural frequency.
     """
-    arm.profile.counts.reductions += 1
     return ritz(arm, _recursion(arm, options).V)
 
 
@@ -173,8 +152,7 @@ def krylov_adjoint(
     arm: ElasticArm,
     basis: Basis,
     options: Options,
-    interior: np.ndarray,
-    outboard: np.ndarray,
+    cotangents: Rows,
 ) -> AdjointFields:
     """Return the fields of `AdjointFields` for cotangents of V of a function of its span.
 
@@ -184,10 +162,9 @@ def krylov_adjoint(
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (b, q) cotangents of its outboard rows.
+        cotangents: (.., q) of the rows of V.
     """
-    recursion = _recursion(arm, options)
+    recursion, (interior, outboard) = _recursion(arm, options), cotangents
     turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
     # Within the span a trajectory that is right to its tolerance leaves cotangents that are not
     # quite zero, and the recursion would amplify them.
@@ -202,10 +179,10 @@ def krylov_adjoint(
         kept, H = block.expansion.kept, block.expansion.coefficients[:, block.expansion.kept]
         old, new = slice(0, len(H) - len(kept)), slice(len(H) - len(kept), len(H))
         inverse = np.linalg.inv(H[new])
-        cotangents = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
-        interior[:, old] -= cotangents[0] @ H[old].T
-        outboard[:, old] -= cotangents[1] @ H[old].T
-        mu = solve_at(arm, block.omega, cotangents)
+        own = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
+        interior[:, old] -= own[0] @ H[old].T
+        outboard[:, old] -= own[1] @ H[old].T
+        mu = solve_at(arm, block.omega, own)
         paired = combine(mu, H.T)
         stiffness[:, :, : len(H)] += paired
         mass[:, :, : len(H)] += block.omega**2 * paired
@@ -306,7 +283,6 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     Raises:
         ConvergenceError: no convergence in the band, or fewer than q directions in it.
     """
-    arm.profile.counts.reductions += 1
     first = arm.static_response(*_inputs(arm))
     space = InverseSpace(arm, first)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)
@@ -434,12 +410,12 @@ class Method:
 
     Attributes:
         reduce: (arm, options, start) -> basis.
-        adjoint: (arm, basis, options, cotangents interior, outboard) -> fields, see
-            `craig_bampton_adjoint`; None where there is none.
+        adjoint: (arm, basis, options, cotangents) -> fields, see `craig_bampton_adjoint`; None
+            where there is none.
     """
 
     reduce: Callable[[ElasticArm, Options, np.ndarray | None], Basis]
-    adjoint: Callable[[ElasticArm, Basis, Options, np.ndarray, np.ndarray], AdjointFields] | None
+    adjoint: Callable[[ElasticArm, Basis, Options, Rows], AdjointFields] | None
 
 
 METHODS = {
