@@ -264,10 +264,6 @@ class Arm:
             raise RuntimeError(f"arm {self.mesh.name!r} has no design yet: call state(x_phys)")
         return self._state
 
-    def set_design(self, x_phys: np.ndarray) -> None:
-        """Make `state(x_phys)` the current state."""
-        self.state(x_phys)
-
     def reduce(self, x_phys: np.ndarray) -> ShapeIntegrals:
         """Return the floating body of physical densities in [0, 1] (collective on the arm)."""
         return self.state(x_phys).body

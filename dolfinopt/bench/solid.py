@@ -75,7 +75,7 @@ def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool = Fals
 
     def dynamic(x: np.ndarray) -> None:
         state = arm.state(arm.physical(x))
-        state.elastic.constraint_modes()
+        _ = state.elastic.constraint_modes
         _ = state.body
         arm.backward(esl_gradient(state, np.eye(6)))
 

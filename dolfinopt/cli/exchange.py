@@ -135,7 +135,7 @@ def export(
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, Profile()))
     with together(world):
         for k, arm in arms.items():
-            arm.set_design(x_phys[k])
+            arm.state(x_phys[k])
     decide_stiffening([loaded, *pose_scenarios(loaded)], partition, arms)
     exported = {k: _exported(arm, loaded.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
     bodies = gather_arms(partition, exported)

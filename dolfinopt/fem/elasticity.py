@@ -348,7 +348,7 @@ class ElasticArm:
             outboard: (b, k) f_b, N, N m.
             inverse: in place of `solve`.
         """
-        modes = self.constraint_modes()
+        modes = self.constraint_modes
         lift = total(self.comm, modes.interior.T @ interior)
         tip = np.linalg.solve(modes.stiffness, outboard + lift)
         return (inverse or self.solve)(interior) + modes.interior @ tip, tip
@@ -375,21 +375,18 @@ class ElasticArm:
         return out[:size], self.comm.bcast(out[size:], root=self.comm.size - 1)
 
     @cached_property
-    def _constraint_modes(self) -> ConstraintModes:
-        return static_modes(self)
-
     def constraint_modes(self) -> ConstraintModes:
-        """Return the static fields of unit displacements of the outboard interface; solved once.
+        """The static fields of unit displacements of the outboard interface.
 
         Raises:
             ConvergenceError: the contrast between solid and void is too large for this design.
         """
-        return self._constraint_modes
+        return static_modes(self)
 
     @property
     def has_constraint_modes(self) -> bool:
         """Whether somebody has asked for them."""
-        return "_constraint_modes" in self.__dict__
+        return "constraint_modes" in self.__dict__
 
     def static_fields(self, loads: np.ndarray) -> StaticFields:
         """Return the static fields that such loads (b, k) of the outboard interfaces need.

@@ -216,7 +216,7 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
 
 def interface_fields(arm: ElasticArm) -> np.ndarray:
     """Return the static fields (n_nodes, d, b) of unit loads of the outboard interfaces."""
-    modes = arm.constraint_modes()
+    modes = arm.constraint_modes
     return combine(modes.field, np.linalg.inv(modes.stiffness))
 
 

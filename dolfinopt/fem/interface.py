@@ -17,7 +17,6 @@ import numpy as np
 import scipy.sparse as sp
 from dolfinx import fem
 from mpi4py import MPI
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
@@ -134,7 +133,7 @@ class InterfaceTransformation:
         nodes = np.flatnonzero(~(self.inboard | self.outboard)[:owned])
         width = 0
         if len(nodes):
-            order, width = _narrow_order(graph[nodes][:, nodes], self.points[nodes])
+            order, width = _along(graph[nodes][:, nodes], self.points[nodes])
             nodes = nodes[order]
         self.bandwidth = self.dim * (self.comm.allreduce(width, op=MPI.MAX) + 1) - 1
         self.interior_nodes = nodes
@@ -244,26 +243,17 @@ class InterfaceTransformation:
         return out
 
 
-def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's."""
-    # The narrower one; on the grid of a slender arm the first, row by row across it, which is half
-    # as wide as the other one, which begins at a corner.
+def _along(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the order of nodes along the arm, row by row across it, and its bandwidth."""
+    # On grids half as wide as Cuthill and McKee's, which begins at a corner; on meshes from files a
+    # sixth wider.
     nearest = GRID_ROUNDING_SHARE * np.ptp(points[:, 0])
     along, *across = (_places(each, nearest) for each in points.T)
-    orders = (
-        np.lexsort((*across, along)),
-        reverse_cuthill_mckee(graph, symmetric_mode=True),
-    )
+    number = np.empty(len(points), dtype=np.int64)
+    order = np.lexsort((*across, along))
+    number[order] = np.arange(len(order))
     rows, columns = graph.nonzero()
-
-    def bandwidth(order: np.ndarray) -> int:
-        number = np.empty(len(order), dtype=np.int64)
-        number[order] = np.arange(len(order))
-        return int(np.abs(number[rows] - number[columns]).max(initial=0))
-
-    widths = [bandwidth(order) for order in orders]
-    best = int(np.argmin(widths))
-    return orders[best], widths[best]
+    return order, int(np.abs(number[rows] - number[columns]).max(initial=0))
 
 
 def _places(values: np.ndarray, nearest: float) -> np.ndarray:
@@ -360,7 +350,7 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
     if new.shape[1] == 0:
         return known
     if arm.has_constraint_modes or extended is None or is_soft(arm):
-        modes = arm.constraint_modes()
+        modes = arm.constraint_modes
         return StaticFields(np.eye(b), modes.field, np.eye(b), modes.stiffness)
     interior, tip = arm.solve_loads(new)
     field = np.concatenate([known.field, arm.expand(interior, tip)], axis=2)

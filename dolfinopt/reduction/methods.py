@@ -50,7 +50,7 @@ def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = 
         options: coordinates q >= b; with q = b no eigenproblem is solved.
         start: `Basis.start` of a nearby design, or None.
     """
-    static = arm.constraint_modes()
+    static = arm.constraint_modes
     b = len(static.stiffness)
     normal = options.coordinates - b
     modes = np.empty((arm.num_interior, 0))

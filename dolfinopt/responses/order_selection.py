@@ -127,7 +127,7 @@ class Comparison:
         self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
         with together(partition.world):
             for k, arm in arms.items():
-                arm.set_design(x_phys[k])
+                arm.state(x_phys[k])
         decide_stiffening(self.scenes, partition, arms)
         self.reductions = Reductions(scene, partition, arms, profile)
         self.richer = 0  # coordinates
