@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.design_state import DesignState, InitialVectors, Kind, options, same_basis
+from dolfinopt.arms.design_state import DesignState, InitialVectors, Kind, same_basis
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import (
     HelmholtzFilter,
@@ -34,7 +34,7 @@ from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
 from dolfinopt.profiling import Profile
-from dolfinopt.reduction import Basis, Options
+from dolfinopt.reduction import Basis
 from dolfinopt.scene import load as scenes
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.responses import STATICS, needs_alone
@@ -378,10 +378,6 @@ class Arm:
             self.stiffening, self._state = None, None
 
     # -- measures ----------------------------------------------------------------------------
-
-    def options(self, num_modes: int) -> Options:
-        """Return what the scene tells the reduction method, with so many modes."""
-        return options(self.scene, num_modes)
 
     def volume_fraction(self, x_phys: np.ndarray) -> float:
         """Return the solid volume over the largest one (collective on the arm)."""

@@ -74,12 +74,12 @@ def contacts_of(
     nodes = nodes.reshape(at.size, -1)
     at, nodes = (one[np.lexsort(np.sort(nodes, axis=1).T)] for one in (at, nodes))
     mesh = _Solid(points, nodes, held[at], volume[at])
-    corner, edge = mesh.contacts(np.ones(at.size, dtype=bool))
+    corner, edge = mesh.contacts(mesh.every)
     kept, joins = mesh.opened()
     found = np.zeros_like(solid)
     found[at[kept]] = True
     return Contacts(
-        pieces=len(np.unique(mesh.pieces(np.ones(at.size, dtype=bool)))),
+        pieces=len(np.unique(mesh.pieces(mesh.every))),
         corners=len(corner),
         edges=len(edge),
         places=mesh.worst([*edge, *corner]),
@@ -97,6 +97,7 @@ class _Solid:
         """Take points (p, d), nodes and interfaces (n, k), volumes (n,)."""
         self.points, self.nodes, self.volume = points, nodes, volume
         (n, k), d = nodes.shape, points.shape[1]
+        self.every = np.ones(n, dtype=bool)
         incidence = sp.csr_matrix(
             (np.ones(n * k), nodes.ravel(), np.arange(0, n * k + 1, k)), (n, len(points))
         )
@@ -137,7 +138,7 @@ class _Solid:
 
     def opened(self) -> tuple[np.ndarray, bool]:
         """Return the cells (n,) that are kept, and whether they join all interfaces."""
-        kept, joins = self._joined(np.ones(len(self.nodes), dtype=bool))
+        kept, joins = self._joined(self.every)
         for _ in range(ROUNDS):
             before, found = kept.copy(), [one for kind in self.contacts(kept) for one in kind]
             for groups in found if len(found) <= MANY else ():
@@ -179,7 +180,7 @@ class _Solid:
 
     def worst(self, found: Sequence[list[np.ndarray]]) -> np.ndarray:
         """Return the places (k, d) of those contacts that join the largest pieces, m."""
-        number = self.pieces(np.ones(len(self.nodes), dtype=bool))
+        number = self.pieces(self.every)
         volume = np.bincount(number, self.volume)
         rank = []
         for groups in found:

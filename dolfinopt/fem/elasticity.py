@@ -8,7 +8,6 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from functools import cached_property
 
@@ -40,14 +39,13 @@ from dolfinopt.fem.interior import (
     interior_layout,
 )
 from dolfinopt.fem.measured import ENERGY_TOLERANCE, STATICS_TOLERANCE
-from dolfinopt.fem.multigrid import box_of
+from dolfinopt.fem.multigrid import Columns, box_of
 from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.fem.stress import stress_operator
 from dolfinopt.fem.tensors import ElementTensors, element_centre
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together, total
 
-Columns = Callable[[np.ndarray], np.ndarray]
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
 
 
@@ -382,11 +380,6 @@ class ElasticArm:
             ConvergenceError: the contrast between solid and void is too large for this design.
         """
         return static_modes(self)
-
-    @property
-    def has_constraint_modes(self) -> bool:
-        """Whether somebody has asked for them."""
-        return "constraint_modes" in self.__dict__
 
     def static_fields(self, loads: np.ndarray) -> StaticFields:
         """Return the static fields that such loads (b, k) of the outboard interfaces need.

@@ -349,7 +349,7 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
     new = on_root(arm.comm, _new_directions, known.directions, loads, error or ENERGY_TOLERANCE)
     if new.shape[1] == 0:
         return known
-    if arm.has_constraint_modes or extended is None or is_soft(arm):
+    if "constraint_modes" in vars(arm) or extended is None or is_soft(arm):
         modes = arm.constraint_modes
         return StaticFields(np.eye(b), modes.field, np.eye(b), modes.stiffness)
     interior, tip = arm.solve_loads(new)

@@ -145,7 +145,7 @@ def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -
     Raises:
         ConvergenceError: fewer than q independent vectors, or a shift at a natural frequency.
     """
-    return ritz(arm, _recursion(arm, options).V)
+    return ritz(arm, _recursion(arm, options)[0])
 
 
 def krylov_adjoint(
@@ -164,8 +164,8 @@ def krylov_adjoint(
         arm, basis, options: of the current design.
         cotangents: (.., q) of the rows of V.
     """
-    recursion, (interior, outboard) = _recursion(arm, options), cotangents
-    turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
+    (_, MV, blocks), (interior, outboard) = _recursion(arm, options), cotangents
+    turn = dot(arm, MV, basis.V)  # basis.V = V turn, an orthogonal matrix
     # Within the span a trajectory that is right to its tolerance leaves cotangents that are not
     # quite zero, and the recursion would amplify them.
     inner = total(arm.comm, interior_rows(arm, basis.V).T @ interior)
@@ -175,7 +175,7 @@ def krylov_adjoint(
     outboard = (outboard - weighted[1] @ inner) @ turn.T
     stiffness, mass = np.zeros_like(basis.V), np.zeros_like(basis.V)
     frame = np.zeros_like(frame_fields(arm))
-    for block in reversed(recursion.blocks):
+    for block in reversed(blocks):
         kept, H = block.expansion.kept, block.expansion.coefficients[:, block.expansion.kept]
         old, new = slice(0, len(H) - len(kept)), slice(len(H) - len(kept), len(H))
         inverse = np.linalg.inv(H[new])
@@ -210,26 +210,19 @@ class _Block:
     expansion: Expansion  # of K_w^-1 f in V, its new columns included
 
 
-@dataclass(frozen=True, eq=False)
-class _Recursion:
-    """M-orthonormal V (n_nodes, d, q), M V, and the blocks that made them, in their order."""
-
-    V: np.ndarray
-    MV: np.ndarray
-    blocks: list[_Block]
+_Chain = tuple[float, _Group | None, np.ndarray]  # shift, inputs and which of them, see `_Block`
 
 
-def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
-    """Build exactly q columns."""
+def _recursion(arm: ElasticArm, options: Options) -> tuple[np.ndarray, np.ndarray, list[_Block]]:
+    """Return M-orthonormal V (n_nodes, d, q), M V, and the blocks that made them, in order."""
     V = MV = np.empty((*arm.points.shape, 0))
     blocks: list[_Block] = []
     omegas = [2.0 * np.pi * shift for shift in options.shifts]
-    chains: list[tuple[float, _Group | None, np.ndarray]] = [
-        (omega, group, np.arange(columns))
-        for group, columns in (
-            (interface_loads, arm.rigid.shape[2]),
-            (frame_loads, 3 if arm.mesh.dim == 2 else 6),
-        )
+    groups = interface_loads, frame_loads
+    counts = arm.rigid.shape[2], 3 if arm.mesh.dim == 2 else 6
+    chains: list[_Chain] = [
+        (omega, group, np.arange(count))
+        for group, count in zip(groups, counts, strict=True)
         for omega in omegas
     ]
     while V.shape[2] < options.coordinates:
@@ -238,7 +231,7 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
                 f"arm {arm.mesh.name!r}: only {V.shape[2]} of {options.coordinates} Krylov vectors "
                 "are independent; ask for fewer reduction.coordinates or move reduction.frequencies"
             )
-        longer: list[tuple[float, _Group | None, np.ndarray]] = []
+        longer: list[_Chain] = []
         for omega, group, columns in chains:
             first = V.shape[2]
             while len(columns) and V.shape[2] < options.coordinates:
@@ -246,14 +239,13 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
                 now, columns = np.split(columns, [options.coordinates - V.shape[2]])
                 right = group(arm) if group else arm.restrict(MV)
                 right = right[0][:, now], right[1][:, now]
-                raw = solve_at(arm, omega, right)
-                new = orthonormalise(arm, raw, V, MV)
+                new = orthonormalise(arm, solve_at(arm, omega, right), V, MV)
                 blocks.append(_Block(omega, group, now, new))
                 V, MV = np.concatenate([V, new.Q], axis=2), np.concatenate([MV, new.MQ], axis=2)
             if V.shape[2] > first:
                 longer.append((omega, None, np.arange(first, V.shape[2])))
         chains = longer
-    return _Recursion(V, MV, blocks)
+    return V, MV, blocks
 
 
 # -- by Gramians: the directions that inputs within a frequency band move most --------------------

@@ -192,7 +192,7 @@ def test_soft_designs_are_judged_by_constraint_modes(width) -> None:
         elastic = arm.substructure.at(young, np.ones_like(young))
         before = arm.profile.counts.solves
         static_response(elastic, np.eye(6)[1:2])
-        assert elastic.has_constraint_modes == soft
+        assert ("constraint_modes" in vars(elastic)) == soft
         assert arm.profile.counts.solves - before == (6 if soft else 1)
 
 
