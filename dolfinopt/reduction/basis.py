@@ -97,9 +97,11 @@ def basis_of(
     arm.profile.counts.reductions += 1
     V = arm.expand(*rows)
     MV = arm.mass_times(V)
-    sign, stiffness = orient(arm, V, MV), np.diag(np.diag(arm.energy_matrix(V)))
+    b = 0 if held is None else len(held)
+    energies = np.diag(arm.energy_matrix(V[:, :, b:]))
+    sign, stiffness = orient(arm, V, MV), np.diag(np.append(np.zeros(b), energies))
     if held is not None:
-        sign[: len(held)], stiffness[: len(held), : len(held)] = 1.0, held
+        sign[:b], stiffness[:b, :b] = 1.0, held
     own = sign[len(sign) - start.shape[1] :]
     return Basis(V * sign, MV * sign, stiffness, rows[1] * sign, start * own)
 
