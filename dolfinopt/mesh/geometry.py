@@ -268,7 +268,7 @@ def _check(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
         name: elements_of(gmsh, dim - 1, groups[tag]) for tag, name in interface_names(arm).items()
     }
     if dim == 2:
-        _check_flat(points[np.unique(cells)], facets["inboard"], arm)
+        _check_flat(points[np.unique(cells)], arm)
     check_mesh(points[:, :dim], cells, facets, arm)
     corners = [points[one][:, :, :dim] for one in facets.values()]
     if dim == 2:
@@ -277,10 +277,8 @@ def _check(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
     return np.concatenate(parts)[:, None]
 
 
-def _check_flat(used: np.ndarray, lines: np.ndarray, arm: Arm) -> None:
-    """Raise InputError unless lines are straight, and points (n, 3) in the plane z = 0."""
-    if lines.shape[1] != 2:
-        raise InputError("its lines are curved; expected straight ones (Mesh.ElementOrder = 1)")
+def _check_flat(used: np.ndarray, arm: Arm) -> None:
+    """Raise InputError unless points (n, 3) are in the plane z = 0."""
     off = np.abs(used[:, 2]).max()
     if off > FILE_ROUNDING_SHARE * arm.height:
         raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")
