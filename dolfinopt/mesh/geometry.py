@@ -87,9 +87,11 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
     """
     unknown: list[str] = []
     where = where_of(arm)
+    readers = {".step": read_step, ".stp": read_step, ".inp": read_inp}
+    reader = readers.get(Path(str(arm.mesh)).suffix.lower(), read_groups)
     with telling_where(where):
         with silent_terminal():
-            groups = _read(gmsh, arm, unknown)
+            groups = reader(gmsh, arm, unknown)
             check_unit(arm.mesh_scale * gmsh.model.mesh.getNodes()[1].reshape(-1, 3), arm)
             groups = placed(gmsh, groups, arm)
         _set_groups(gmsh, groups, arm)
@@ -99,11 +101,6 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
     if SOLID in _parameters(gmsh):
         facets = facets[:0]
     return facets, (_unknown_names(where, unknown),) if unknown else ()
-
-
-def _read(gmsh: Any, arm: Arm, unknown: list[str]) -> Entities:
-    readers = {".step": read_step, ".stp": read_step, ".inp": read_inp}
-    return readers.get(Path(str(arm.mesh)).suffix.lower(), read_groups)(gmsh, arm, unknown)
 
 
 def read_groups(gmsh: Any, arm: Arm, unknown: list[str]) -> Entities:
@@ -268,17 +265,12 @@ def _check(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
         name: elements_of(gmsh, dim - 1, groups[tag]) for tag, name in interface_names(arm).items()
     }
     if dim == 2:
-        _check_flat(points[np.unique(cells)], arm)
+        off = np.abs(points[np.unique(cells), 2]).max()
+        if off > FILE_ROUNDING_SHARE * arm.height:
+            raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")
     check_mesh(points[:, :dim], cells, facets, arm)
     corners = [points[one][:, :, :dim] for one in facets.values()]
     if dim == 2:
         return np.concatenate(corners)
     parts = [part for one in corners for part in (one.reshape(-1, 3), one.mean(axis=1))]
     return np.concatenate(parts)[:, None]
-
-
-def _check_flat(used: np.ndarray, arm: Arm) -> None:
-    """Raise InputError unless points (n, 3) are in the plane z = 0."""
-    off = np.abs(used[:, 2]).max()
-    if off > FILE_ROUNDING_SHARE * arm.height:
-        raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")
