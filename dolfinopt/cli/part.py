@@ -50,8 +50,8 @@ Say = Callable[[str], None]
     metavar="M",
     help="how far sides may lie from the outline of the densities; default: half a cell",
 )
-@click.option("--curves", type=click.Choice(["splines", "arcs"]), hidden=True)  # no effect
-@click.option("--simplify/--no-simplify", default=None, hidden=True)  # no effect
+@click.option("--curves", hidden=True, expose_value=False)  # of splines: no effect
+@click.option("--simplify/--no-simplify", hidden=True, expose_value=False)  # no effect
 @click.option("--round", "rounds", is_flag=True, help="radii of whole half millimetres")
 @click.option(
     "--check/--no-check",
@@ -79,8 +79,6 @@ def part(
     out: Path | None,
     tool_radius: float | None,
     tolerance: float | None,
-    curves: str | None,
-    simplify: bool | None,
     rounds: bool,
     check: bool,
     optimize: bool | None,
@@ -114,12 +112,14 @@ def part(
     scene: Scene = on_root(world, scene_of, folder, overrides)
     target = out or folder / "part"
     scene.check_designed()
-    given = {"tool_radius": tool_radius, "tolerance": tolerance, "curves": curves,
-             "simplify": simplify, "optimize": optimize, "iterations": iterations,
-             "starts": starts}  # fmt: skip
+    given = {
+        "tool_radius": tool_radius,
+        "tolerance": tolerance,
+        "optimize": optimize,
+        "iterations": iterations,
+        "starts": starts,
+    }
     asked = scene.part.unchecked_copy({k: v for k, v in given.items() if v is not None})
-    if world.rank == 0 and (asked.curves != "splines" or asked.simplify):
-        warn(["part.curves and part.simplify have no effect: parts have lines, arcs and circles"])
     if resume and not asked.optimize:
         raise InputError("--resume: goes on with --optimize, which is not asked for")
     names = [*file_names(scene), SHAPES]

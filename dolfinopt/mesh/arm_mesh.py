@@ -418,6 +418,6 @@ def _hull(gmsh: Any, arm: scenes.Arm) -> Hull:
         return read_hull(gmsh, arm)
     assert arm.cells is not None and len(arm.cells) == 3
     size = arm.length, arm.height, arm.thickness
-    if arm.section == "tube":
+    if arm.hollow == "tube":
         return tube_hull(size, arm.cells)
     return box_hull(size, arm.cells, arm.wall_limits[1])

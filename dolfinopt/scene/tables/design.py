@@ -501,13 +501,6 @@ class Part(Table):
         description="smallest width of members of a part; default: design.minimum_member, or 0.001 "
         "[m]",
     )
-    curves: Literal["splines", "arcs"] = Field(
-        default="splines", description="without effect: parts have lines, arcs and circles [-]"
-    )
-    simplify: bool = Field(
-        default=False,
-        description="without effect: sides are straight, with fillets between them [-]",
-    )
     optimize: bool = Field(
         default=False,
         description="optimise the parts' free curves, too: the scene's objective within its limits "
