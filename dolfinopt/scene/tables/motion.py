@@ -174,9 +174,9 @@ class Motion(Table):
         self.refuse_unused(not joints, "path", "cart_follow", "elbow")
         if self.path == "rotation" and self.base != "fixed":
             raise Refusal('expected "fixed" with motion.path = "rotation"', ("base",), ("path",))
-        self._check_law()
         self.refuse_unused(self.base == "cart", "base", "cart_follow", "cart_mass")
         self.refuse_unused(self.base == "fixed", "base", "base_position")
+        self._check_law()
         return self
 
     def _check_law(self) -> None:
