@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import (
     Duration,
     FileName,
@@ -32,6 +33,7 @@ Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
 Gravity = tuple[Acceleration, Acceleration] | tuple[Acceleration, Acceleration, Acceleration]
 Instant = Annotated[float, Field(ge=0, le=1e5)]  # s
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
+LIMITS = ("max_speed", "max_acceleration", "max_jerk")
 
 
 class Motion(Table):
@@ -184,8 +186,7 @@ class Motion(Table):
         profile = self.law in ("trapezoidal", "s-curve")
         self.refuse_unused(profile, "law", "acceleration_share")
         self.refuse_unused(self.law != "trapezoidal", "law", "max_jerk")
-        limits = ("max_speed", "max_acceleration", "max_jerk")
-        self.refuse_unused(self.path not in ("joints", "rotation"), "path", *limits)
+        self.refuse_unused(self.path not in ("joints", "rotation"), "path", *LIMITS)
         last = "max_jerk" if self.law == "s-curve" else "max_acceleration"
         share = type(self).model_fields["acceleration_share"].default
         if profile and getattr(self, last) is not None and self.acceleration_share != share:
@@ -227,6 +228,25 @@ class Motion(Table):
             )
         return self
 
+    def _check_limits(self) -> None:
+        """Refuse a duration in which the limits cannot be kept."""
+        limits = [key for key in LIMITS if getattr(self, key) is not None]
+        if not limits:
+            return
+        from dolfinopt.scene.duration import SAME_TIME, least_duration  # NumPy, only needed here
+
+        try:
+            least, limited = least_duration(self)
+        except InputError:  # told by whoever reads the table
+            return
+        if limited and least is not None and self.duration < least * (1.0 - SAME_TIME):
+            raise Refusal(
+                f"expected at least {least:.6g} [s] by the limits ({', '.join(limits)}); leave it "
+                "out to use this value, or raise the limits",
+                ("motion", "duration"),
+                *(("motion", key) for key in limits),
+            )
+
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
         if self.table_ends == "moving" and self.horizon > self.duration:
@@ -236,6 +256,7 @@ class Motion(Table):
                 ("motion", "horizon"),
                 ("motion", "table_ends"),
             )
+        self._check_limits()
         if scene.is_spatial:
             return  # `tables.joints` knows
         for key in ("gravity", "start", "end"):
