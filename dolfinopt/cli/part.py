@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +14,13 @@ import click
 
 from dolfinopt.cli.shared import (
     PATH,
+    Say,
     claim,
     elapsed,
     out_option,
     overwrite_option,
     plots_option,
+    progress,
     scene_of,
     start,
     warn,
@@ -26,16 +28,12 @@ from dolfinopt.cli.shared import (
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
     from dolfinopt.part.check import Check
     from dolfinopt.part.folder import Saved
     from dolfinopt.part.optimize import Keep, Optimized
     from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
     from dolfinopt.scene.tables.design import Part as Asked
-
-Say = Callable[[str], None]
 
 
 @click.command()
@@ -126,7 +124,7 @@ def part(
     claim(world, target, overwrite or resume, names, resume=SHAPES, scene=scene)
     kept = on_root(world, checkpoint_of_search, target, folder, scene, asked)
     known = on_root(world, kept.read) if resume else ()
-    with _stages(world) as say:
+    with progress(world) as say:
         say("outlines and surfaces")
         wanted = Curves(asked.tool_radius, asked.tolerance, rounds)
         try:
@@ -157,21 +155,6 @@ def part(
             raise KeyboardInterrupt(
                 f"the best parts so far are in {target}; to go on, add --resume"
             )
-
-
-@contextmanager
-def _stages(world: MPI.Comm) -> Iterator[Say]:
-    """Yield a function that shows what is being done, on the root's terminal."""
-    if world.rank != 0:
-        yield lambda _: None
-        return
-    if not sys.stderr.isatty():
-        yield lambda stage: click.echo(f"{elapsed():.1f} s: {stage}", err=True)
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status("") as status:
-        yield lambda stage: status.update(f"{elapsed():.1f} s: {stage}")
 
 
 @contextmanager

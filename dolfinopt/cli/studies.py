@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,7 @@ from dolfinopt.cli.shared import (
     overwrite_option,
     plots_option,
     prepare,
+    progress,
     scene_argument,
     set_option,
     start,
@@ -432,33 +432,9 @@ def _measure(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     folder = out or Path("results") / "bench"
     prepare(world, folder)
     plan = Plan(load_paper(overrides=QUICKLY if quick else ()), quick)
-    with _progress(len(chosen)) as (tell, done):
-        failures = run(plan, folder, chosen, tell, done)
+    with progress(world) as say:
+        failures = run(plan, folder, chosen, say, partial(click.echo, err=True))
     seconds = time.perf_counter() - begun
     click.echo(f"diagrams in {folder}, summary in {folder / 'bench.md'}; {seconds:.0f} s")
     if failures:
         raise ConvergenceError("; ".join(failures))
-
-
-@contextmanager
-def _progress(count: int) -> Iterator[tuple[Callable[[str], None], Callable[[str], None]]]:
-    """Yield what shows a step on a live line, or prints it, and what prints a finished diagram."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True, highlight=False, markup=False)
-
-    def line(text: str) -> None:
-        console.print(text, soft_wrap=True)
-
-    if not console.is_terminal:
-        yield line, line
-        return
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("starting", total=count)
-
-        def done(text: str) -> None:
-            line(text)
-            progress.advance(task)
-
-        yield lambda text: progress.update(task, description=text.replace("[", r"\[")), done

@@ -27,7 +27,7 @@ from scipy.io import loadmat
 
 import dolfinopt as do
 from dolfinopt.cli import shared
-from dolfinopt.cli.shared import plain_lines
+from dolfinopt.cli.shared import in_words, progress
 from dolfinopt.disk import RUN
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.folders import RUN_FILES
@@ -442,13 +442,13 @@ def test_arm_of_a_file_without_geometric_stiffness(tmp_path, capsys, stiffening)
 @pytest.mark.serial
 def test_lines_without_a_terminal(capsys):
     """The first row's wait is no silence, either; the last row is repeated while nothing comes."""
-    with plain_lines(400, every=0.05) as show:
+    with progress(MPI.COMM_SELF, every=0.05) as say:
         deadline = time.monotonic() + 10.0
         text = ""
         while "setting up" not in text and time.monotonic() < deadline:
             time.sleep(0.01)
             text += capsys.readouterr().err
-        show(HistoryRow(7, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0))
+        say(in_words(HistoryRow(7, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0), 400))
         while text.count("7/400") < 2 and time.monotonic() < deadline:
             time.sleep(0.01)
             text += capsys.readouterr().err
@@ -460,8 +460,8 @@ def test_lines_without_a_terminal(capsys):
 
 @pytest.mark.serial
 def test_a_short_run_says_nothing(capsys):
-    with plain_lines(10, every=60.0) as show:
-        show(HistoryRow(1, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0))
+    with progress(MPI.COMM_SELF, every=60.0) as say:
+        say("1/10")
     assert capsys.readouterr().err == ""
 
 
