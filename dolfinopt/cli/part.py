@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -296,21 +295,18 @@ class Made:
 
 def tell(check: Check) -> None:
     """Print the table of a check and what it says."""
-    from rich.console import Console
-    from rich.table import Table
+    from pandas import DataFrame
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
     against = "part/density" if check.crisp is None else "part/crisp"
     figures = check.table()
     forms = [name for name in figures.columns if name != "unit" and "/" not in name]
-    for name in ("", *forms, "unit", against):
-        table.add_column(name, justify="left" if name in ("", "unit") else "right")
-    for name, row in figures.iterrows():
-        values = [f"{row[form]:.4g}" for form in forms]
-        ratio = f"{100.0 * row[against]:+.2f} %"
-        cells = [str(name).replace("_", " "), *values, row["unit"], ratio]
-        table.add_row(*("-" if "nan" in cell else cell for cell in cells))
-    Console(highlight=False, width=None if sys.stdout.isatty() else 100).print(table)
+    rows = [
+        [*(f"{row[form]:.4g}" for form in forms), row["unit"], f"{100.0 * row[against]:+.2f} %"]
+        for _, row in figures.iterrows()
+    ]
+    names = [str(name).replace("_", " ") for name in figures.index]
+    cells = [["-" if "nan" in cell else cell for cell in row] for row in rows]
+    click.echo(DataFrame(cells, names, [*forms, "unit", against]).to_string())
     for line in (check.loss, *check.notes):
         click.echo(line)
     for limit in check.part.limits:
