@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import threading
 import time
@@ -204,24 +203,12 @@ def chosen(coordinates: int, error: float) -> str:
     )
 
 
+BEGUN = time.perf_counter()
+
+
 def elapsed() -> float:
-    """Return the seconds that the user has waited: since the process was started."""
+    """Return the seconds since the command line began."""
     return time.perf_counter() - BEGUN
-
-
-def _age() -> float:
-    """Return how long ago this process was started, s; 0 where the system does not tell."""
-    # The launcher's process becomes this one after its set-up, which does not count.
-    try:
-        words = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(words[19]) / os.sysconf("SC_CLK_TCK")
-        age = min(age, time.time() - float(os.environ.get("DOLFINOPT_STARTED", "-inf")))
-    except (OSError, ValueError, IndexError, AttributeError):
-        return 0.0
-    return age if 0.0 <= age < 600.0 else 0.0  # imports do not take longer: another clock
-
-
-BEGUN = time.perf_counter() - _age()
 
 
 # -- options that several commands have ----------------------------------------------------------

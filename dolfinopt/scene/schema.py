@@ -399,7 +399,7 @@ def scene_schema() -> dict[str, Any]:
 
     It knows keys, types and ranges; what depends on several keys is checked when a scene is read.
     """
-    schema = _plain(Scene.model_json_schema())
+    schema = _plain(Scene.model_json_schema(ref_template="#/definitions/{model}"))
     schema["definitions"] = schema.pop("$defs")
     schema["required"].remove("name")  # by default the file's
     schema["properties"]["arms"]["minItems"] = 1
@@ -434,8 +434,6 @@ def _plain(node: Any) -> Any:
             found[key] = {name: _plain(item) for name, item in value.items()}
         elif key == "prefixItems":
             found["items"] = _plain(value)
-        elif key == "$ref":
-            found[key] = value.replace("#/$defs/", "#/definitions/")
         elif key != "title" and (key, value) != ("default", None):
             found[key] = _plain(value)
     return found

@@ -26,7 +26,6 @@ from runs import (
 from scipy.io import loadmat
 
 import dolfinopt as do
-from dolfinopt.cli import shared
 from dolfinopt.cli.shared import in_words, progress
 from dolfinopt.disk import RUN
 from dolfinopt.optimization.state import HistoryRow
@@ -197,17 +196,6 @@ def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
     assert (expected["esl"] < 0.0).all()  # under frozen loads more material is always stiffer
     if WORLD.rank == 0:
         assert f"{kind} gradient in" in capsys.readouterr().out
-
-
-@pytest.mark.serial
-def test_the_launchers_set_up_does_not_count(monkeypatch):
-    """The launcher's process, which may have installed everything, becomes the command's."""
-    monkeypatch.setenv("DOLFINOPT_STARTED", str(time.time() + 1e3))
-    assert shared._age() == 0.0
-    monkeypatch.setenv("DOLFINOPT_STARTED", "0")
-    with_all = shared._age()
-    monkeypatch.delenv("DOLFINOPT_STARTED")
-    assert shared._age() >= with_all  # of a later moment
 
 
 USED = {
