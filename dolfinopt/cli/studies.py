@@ -171,11 +171,6 @@ def sweep(
     whatever --vary names. What is computed is kept in DIR: a sweep that was interrupted, or that
     grows, takes it from there.
     """
-    if preset is None and not vary:
-        raise InputError(
-            "sweep: name payload, flattening or coordinates, or what to --vary "
-            "(see dolfinopt sweep --help)"
-        )
     from dolfinopt.study.studies import study, sweep_name
 
     do = partial(study, scene, preset, vary, designs, reoptimize=reoptimize)
@@ -192,8 +187,6 @@ def sweep(
     help="any number of times: of the objectives a kind, by default all; of the reductions a "
     "number of coordinates, by default 4 and 12",
 )
-@click.option("--coordinates", multiple=True, hidden=True)
-@click.option("--kind", "kinds", multiple=True, hidden=True)
 @click.option(
     "--design",
     "designs",
@@ -207,8 +200,6 @@ def compare(
     scene: Scene,
     what: str,
     only: tuple[str, ...],
-    coordinates: tuple[str, ...],
-    kinds: tuple[str, ...],
     designs: tuple[Path, ...],
 ) -> Question:
     """Optimise SCENE for every objective or with every reduction, and compare the designs.
@@ -222,14 +213,6 @@ def compare(
     """
     if only and what in (SECTIONS, MOTIONS):
         raise InputError("--only: expected only with compare SCENE objectives or reductions")
-    coordinates += only if what == "reductions" else ()
-    kinds += only if what == "objectives" else ()
-    if designs and what not in (SECTIONS, MOTIONS):
-        raise InputError("--design: expected only with compare SCENE sections or motions")
-    if coordinates and what != "reductions":
-        raise InputError("--coordinates: expected only with compare SCENE reductions")
-    if kinds and what != "objectives":
-        raise InputError("--kind: expected only with compare SCENE objectives")
     if what == SECTIONS:
         from dolfinopt.study.sections import NAME, study_sections
 
@@ -241,8 +224,9 @@ def compare(
     from dolfinopt.study.studies import study
 
     preset: Any = COMPARED[what]
-    vary = [f"reduction.coordinates={','.join(map(str, coordinates))}"] if coordinates else []
-    return preset, [], partial(study, scene, preset, vary, [], kinds=kinds), {}
+    vary = [f"reduction.coordinates={','.join(only)}"] if only and what == "reductions" else []
+    kinds = only if what == "objectives" else ()
+    return preset, designs, partial(study, scene, preset, vary, designs, kinds=kinds), {}
 
 
 @click.command()
