@@ -320,17 +320,9 @@ FIELD = "field"
 
 
 @click.command()
-@click.argument("names", metavar="[DIAGRAM]...", nargs=-1)
+@click.argument("names", metavar="[DIAGRAM... | field [CASE...]]", nargs=-1)
 @out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
 @click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
-@click.option(
-    "--case",
-    "cases",
-    metavar="NAME",
-    multiple=True,
-    help='of field: this case alone; "all": the long ones, too',
-)
-@click.option("--all", "everything", is_flag=True, hidden=True)
 @click.option(
     "--records", type=PATH, metavar="DIR", help="of field: measured records that a case reads"
 )
@@ -338,8 +330,6 @@ def bench(
     names: tuple[str, ...],
     out: Path | None,
     quick: bool,
-    cases: tuple[str, ...],
-    everything: bool,
     records: Path | None,
 ) -> None:
     """Measure run time against error, or check the benchmark of the field.
@@ -353,41 +343,32 @@ def bench(
 
     `dolfinopt bench field` runs the published problems of the folder benchmarks and prints every
     value beside its reference, with difference, limit and verdict; exit status 1 where a limit is
-    missed. By default the quick cases, some ten seconds; with --records DIR those, too, that read
-    measured records which cannot be copied: ur10e.
+    missed. By default the quick cases, some ten seconds; those named alone; "all" with the long
+    ones; with --records DIR those, too, that read measured records which cannot be copied: ur10e.
     """
     world = start()
-    if cases == ("all",):
-        cases, everything = (), True
-    if FIELD in names:
-        if len(names) > 1 or quick:
-            other = "--quick" if quick else next(name for name in names if name != FIELD)
-            raise InputError(f"bench field: {other} does not go with it; call it alone")
-        _check_field(world, out, cases, everything, records)
+    if names[:1] == (FIELD,):
+        if quick:
+            raise InputError("bench field: --quick does not go with it")
+        _check_field(world, out, names[1:], records)
         return
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    if cases or everything or records:
-        raise InputError("bench: --case and --records belong to dolfinopt bench field")
+    if records:
+        raise InputError("bench: --records belongs to dolfinopt bench field")
     _measure(names, out, quick)
 
 
 def _check_field(
-    world: MPI.Comm,
-    out: Path | None,
-    names: tuple[str, ...],
-    everything: bool,
-    records: Path | None,
+    world: MPI.Comm, out: Path | None, names: tuple[str, ...], records: Path | None
 ) -> None:
     """Run cases of the benchmark on the root; print each one's values when it is done."""
     from dolfinopt.bench.field import check, chosen_cases, table_of
     from dolfinopt.disk import write_text
     from dolfinopt.parallel import on_root
 
-    if names and everything:
-        raise InputError('bench field: --case: expected names, or "all" alone')
     found = []
-    for case in chosen_cases(names, everything, records is not None):
+    for case in chosen_cases(names, records is not None):
         checked = on_root(world, check, case, records)
         found += checked
         if world.rank == 0:
