@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.errors import ConvergenceError, InputError, OutputError, missing_package
+from dolfinopt.errors import ConvergenceError, InputError, MissingLibrary, line_of
 from dolfinopt.interrupt import (
     INTERRUPTED,
     end_at_once,
@@ -280,10 +280,6 @@ def out_option(what: str) -> Callable[..., Any]:
 NEEDED = ("petsc4py", "slepc4py", "mpi4py", "dolfinx", "gmsh")
 
 
-class MissingLibrary(RuntimeError):
-    """A library that does not come with pip is not installed."""
-
-
 class Start:
     """Loads MPI when a command asks for the ranks; from then on all ranks end together."""
 
@@ -354,15 +350,12 @@ def end_before_start(error: BaseException) -> int:
     told_by_another = (launched_rank() or 0) > 0
     if isinstance(error, InputError | ConvergenceError | KeyboardInterrupt) and told_by_another:
         return 0
-    if isinstance(error, KeyboardInterrupt):
-        print(": ".join(["dolfinopt", "interrupted", *map(str, error.args)]), file=sys.stderr)
-        return INTERRUPTED
-    if isinstance(error, InputError | ConvergenceError | OutputError | MissingLibrary):
-        print(f"dolfinopt: {error}", file=sys.stderr)
-    elif missing := missing_package(error):
-        print(f"dolfinopt: {missing}", file=sys.stderr)
+    if line := line_of(error):
+        print(line, file=sys.stderr)
     else:
         traceback.print_exception(error)
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
     return 2 if isinstance(error, InputError) else 1
 
 

@@ -260,7 +260,7 @@ def _check(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
     dim = 3 if arm.is_solid else 2
     points, regions = points_by_tag(gmsh), [one for tag in REGIONS for one in groups[tag]]
     cells = elements_of(gmsh, dim, regions)
-    cells = cells[:, TENSOR[dim, cells.shape[1]]]
+    cells = cells[:, TENSOR[cells.shape[1], dim]]
     facets = {
         name: elements_of(gmsh, dim - 1, groups[tag]) for tag, name in interface_names(arm).items()
     }

@@ -51,12 +51,13 @@ STRAIGHT = {  # by dimension and number of corners
     (3, 4): TETRAHEDRON,
     (3, 8): HEXAHEDRON,
 }
-# From Gmsh's order of corners to that of a tensor product, DOLFINx's.
-TENSOR = {
-    (2, 3): [0, 1, 2],
-    (2, 4): [0, 1, 3, 2],
-    (3, 4): [0, 1, 2, 3],
-    (3, 8): [0, 1, 3, 2, 4, 5, 7, 6],
+# From Gmsh's and VTK's order of corners, around the cell, to that of a tensor product, DOLFINx's,
+# and back; by the number of corners and the dimension.
+TENSOR: dict[tuple[int, ...], list[int]] = {
+    (3, 2): [0, 1, 2],
+    (4, 2): [0, 1, 3, 2],
+    (4, 3): [0, 1, 2, 3],
+    (8, 3): [0, 1, 3, 2, 4, 5, 7, 6],
 }
 # Sides of cells in Gmsh's order of corners, around them, by the number of corners.
 SIDES = {
@@ -320,11 +321,7 @@ def _filled_anew(gmsh: Any, mesh: Tetrahedra, size: float) -> Tetrahedra:
     rim = np.unique(facets)
     number = np.full(len(mesh.points), -1)
     number[rim] = np.arange(len(rim))
-    model = gmsh.model
-    model.add("surface")
-    model.addDiscreteEntity(2, 1)
-    model.mesh.addNodes(2, 1, np.arange(1, len(rim) + 1), mesh.points[rim].ravel())
-    model.mesh.addElementsByType(1, TRIANGLE, [], number[facets].ravel() + 1)
+    _add_surface(gmsh, mesh.points[rim], number[facets])
     solid = _generated(gmsh, [1], size)
     found = _cells(gmsh, solid, {group: [] for group in ENDS})
     if found.volumes.min() <= 0.0 or not np.array_equal(found.points[: len(rim)], mesh.points[rim]):
@@ -347,6 +344,15 @@ def _with_gmsh(work: Callable[..., Tetrahedra], *given: Any) -> Tetrahedra:
         return work(gmsh, *given)
 
 
+def _add_surface(gmsh: Any, points: np.ndarray, triangles: np.ndarray) -> None:
+    """Make triangles (m, 3) of points (n, 3) surface 1 of a new model."""
+    mesh = gmsh.model.mesh
+    gmsh.model.add("surface")
+    gmsh.model.addDiscreteEntity(2, 1)
+    mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
+    mesh.addElementsByType(1, TRIANGLE, [], triangles.ravel() + 1)
+
+
 def _generated(gmsh: Any, faces: list[int], size: float) -> int:
     """Mesh the solid within faces; return its number."""
     geo = gmsh.model.geo
@@ -367,11 +373,8 @@ def _meshed(
     interfaces: tuple[np.ndarray, np.ndarray],
     edge: float,
 ) -> Tetrahedra:
+    _add_surface(gmsh, points, triangles)
     model = gmsh.model
-    model.add("surface")
-    model.addDiscreteEntity(2, 1)
-    model.mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
-    model.mesh.addElementsByType(1, TRIANGLE, [], triangles.ravel() + 1)
     model.mesh.classifySurfaces(edge, True, True, math.pi)
     model.mesh.createGeometry()
     faces = [tag for _, tag in model.getEntities(2)]

@@ -277,7 +277,7 @@ def test_volume(kind, share):
     """Cells are valid and have the section's area, the circle's too, all along."""
     section = MESHED[kind]
     found = member(section, LENGTH, (HEIGHT, THICKNESS), share)
-    cells = found.cells[:, TENSOR[3, 8]]
+    cells = found.cells[:, TENSOR[8, 3]]
     check_cells(found.points, cells)
     area = section.area(HEIGHT, THICKNESS, share)
     assert area == pytest.approx(moments(kind, share)[0], rel=1e-12)

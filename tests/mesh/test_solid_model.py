@@ -208,8 +208,8 @@ HOLLOW = ("arms.link1.hollow=true", "arms.link1.wall=0.002")
 def test_the_wall_has_the_volume_of_its_section(hull, area):
     """To rounding: mitred corners of a box, and a circle's area of a polygon."""
     mesh = hull.member(WALL)
-    check_cells(mesh.points, mesh.cells[:, TENSOR[3, 8]])
-    assert cell_sizes(mesh.points[mesh.cells[:, TENSOR[3, 8]]]).sum() == pytest.approx(area * 0.5)
+    check_cells(mesh.points, mesh.cells[:, TENSOR[8, 3]])
+    assert cell_sizes(mesh.points[mesh.cells[:, TENSOR[8, 3]]]).sum() == pytest.approx(area * 0.5)
     assert len(mesh.inboard) == len(mesh.outboard) == hull.shape[1]
 
 
