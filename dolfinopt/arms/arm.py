@@ -375,7 +375,9 @@ class Arm:
         self.initial.basis = None
         self.initial.loaded.clear()
         if self.stiffening is not None:
-            self.stiffening, self._state = None, None
+            self.stiffening = None
+            if self._state is not None:  # of the same design the factor stays
+                self._state = replace(self._state, stiffened=self.stiffened)
 
     # -- measures ----------------------------------------------------------------------------
 
