@@ -6,7 +6,6 @@ There are b = 3 outboard coordinates in the plane, in space 6 of every outboard 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,6 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from dolfinx import fem
 from mpi4py import MPI
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
@@ -69,7 +69,7 @@ class InterfaceTransformation:
             graph: (n_nodes, n_nodes) with an entry where two nodes share a cell.
 
         Raises:
-            InputError: the mesh lacks an interface.
+            InputError: the mesh lacks an interface, or two share a node.
         """
         self.comm = mesh.comm
         self._space = operators.space
@@ -79,7 +79,12 @@ class InterfaceTransformation:
         sides = {"inboard": mesh.inboard_facets, "outboard": mesh.outboard_facets}
         sides |= {one.name: one.facets for one in mesh.further}
         masks = {name: self._nodes_of(mesh, facets, name) for name, facets in sides.items()}
-        self._check_apart(mesh, masks)
+        for one, other in combinations(masks, 2):
+            if self.comm.allreduce(int((masks[one] & masks[other]).sum())):
+                raise InputError(
+                    f"arm {mesh.name!r}: interfaces {one!r} and {other!r} share nodes; "
+                    "each is rigid: leave a cell between them"
+                )
         self.inboard, *self.ends = masks.values()
         self.outboard = np.any(self.ends, axis=0)
         self.places = np.array([mesh.outboard_point, *mesh.further_points])
@@ -104,15 +109,6 @@ class InterfaceTransformation:
         ]
         return np.concatenate(parts, axis=2)
 
-    def _check_apart(self, mesh: ArmMesh, masks: Mapping[str, np.ndarray]) -> None:
-        """Raise InputError where two interfaces, rigid both, share a node."""
-        for one, other in combinations(masks, 2):
-            if self.comm.allreduce(int((masks[one] & masks[other]).sum())):
-                raise InputError(
-                    f"arm {mesh.name!r}: interfaces {one!r} and {other!r} share nodes; "
-                    "each is rigid: leave a cell between them"
-                )
-
     def _nodes_of(self, mesh: ArmMesh, facets: np.ndarray, side: str) -> np.ndarray:
         """Return (n_nodes,) True for the nodes of the interface `side`."""
         mask = np.zeros(len(self.points), dtype=bool)
@@ -133,7 +129,7 @@ class InterfaceTransformation:
         nodes = np.flatnonzero(~(self.inboard | self.outboard)[:owned])
         width = 0
         if len(nodes):
-            order, width = _along(graph[nodes][:, nodes], self.points[nodes])
+            order, width = _narrow_order(graph[nodes][:, nodes], self.points[nodes])
             nodes = nodes[order]
         self.bandwidth = self.dim * (self.comm.allreduce(width, op=MPI.MAX) + 1) - 1
         self.interior_nodes = nodes
@@ -243,17 +239,22 @@ class InterfaceTransformation:
         return out
 
 
-def _along(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return the order of nodes along the arm, row by row across it, and its bandwidth."""
-    # On grids half as wide as Cuthill and McKee's, which begins at a corner; on meshes from files a
-    # sixth wider.
+def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return an order of nodes and its bandwidth: along the arm, or Cuthill and McKee's."""
+    # The narrower one; on the grid of a slender arm the first, row by row across it, which is half
+    # as wide as the other one, which begins at a corner.
     nearest = GRID_ROUNDING_SHARE * np.ptp(points[:, 0])
     along, *across = (_places(each, nearest) for each in points.T)
-    number = np.empty(len(points), dtype=np.int64)
-    order = np.lexsort((*across, along))
-    number[order] = np.arange(len(order))
     rows, columns = graph.nonzero()
-    return order, int(np.abs(number[rows] - number[columns]).max(initial=0))
+    number = np.empty(len(points), dtype=np.int64)
+
+    def bandwidth(order: np.ndarray) -> int:
+        number[order] = np.arange(len(order))
+        return int(np.abs(number[rows] - number[columns]).max(initial=0))
+
+    orders = np.lexsort((*across, along)), reverse_cuthill_mckee(graph, symmetric_mode=True)
+    best = min(orders, key=bandwidth)
+    return best, bandwidth(best)
 
 
 def _places(values: np.ndarray, nearest: float) -> np.ndarray:

@@ -122,7 +122,14 @@ def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
         bad = _covered(corners)
     kind, shared = ("surfaces", "curves") if dim == 2 else ("volumes", "faces")
     _refuse(bad, corners, f"overlap others (inverted cells, or {kind} on top of each other)")
-    _check_parts(cells, f"{kind} must share their {shared}")
+    starts = cells.shape[1] * np.arange(len(cells) + 1)
+    incidence = sp.csr_matrix((np.ones(cells.size), cells.ravel(), starts))
+    pieces = connected_components(incidence @ incidence.T, directed=False)[0]
+    if pieces > 1:
+        raise InputError(
+            f"it consists of {pieces} separate parts; neighbouring {kind} must share their "
+            f"{shared} and nodes"
+        )
 
 
 def check_facets(facets: np.ndarray, cells: np.ndarray, dim: int, name: str) -> None:
@@ -217,15 +224,6 @@ def _overlapping(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
         bad[which[one_side] % count] = True
     bad[order[2:][known[2:] == known[:-2]] % count] = True  # three cells at one facet
     return bad
-
-
-def _check_parts(cells: np.ndarray, what: str) -> None:
-    count, width = cells.shape
-    start = np.arange(0, count * width + 1, width)
-    incidence = sp.csr_matrix((np.ones(cells.size), cells.ravel(), start))
-    pieces = connected_components(incidence @ incidence.T, directed=False)[0]
-    if pieces > 1:
-        raise InputError(f"it consists of {pieces} separate parts; neighbouring {what} and nodes")
 
 
 # -- cells with straight edges: which corners their facets have, areas and volumes ---------------
