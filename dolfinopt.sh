@@ -155,9 +155,6 @@ ensure() {
   ) 9<"$here" || exit
 }
 
-# The seconds that a run tells begin here: what came before was the set-up.
-begin_clock() { DOLFINOPT_STARTED=$(date +%s.%N) && export DOLFINOPT_STARTED; }
-
 # --- running --------------------------------------------------------------------------------------
 
 # Containers without an /etc/hosts wait 5 s in MPI_Init for a name server to know them.
@@ -305,7 +302,6 @@ case ${1-} in
     fi
     ensure ready "${here}[robots]"
     answer_soon
-    begin_clock
     [ -n "$ranks" ] || exec "$python" "$@"
     exec 2> >(drop_chatter >&2)
     exec /usr/bin/mpirun -n "$ranks" "$python" "$@"
@@ -313,7 +309,6 @@ case ${1-} in
   *)
     ensure ready "${here}[robots]"
     answer_soon
-    begin_clock
     # -P: a file in the current folder must not take the place of a module.
     [ -n "$ranks" ] || exec "$python" -P -m dolfinopt "$@"
     exec 2> >(drop_chatter >&2)

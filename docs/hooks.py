@@ -190,9 +190,9 @@ def field_page() -> str:
         "Published problems of flexible machines in motion, with geometry, motion, design and",
         "numbers together, so that programs can be compared. Statements, reference values and our",
         "results are in the folder `benchmarks` of the source, free for any use (CC0).",
-        "`dolfinopt bench field` runs them and compares; `--all` includes the long ones, `--case",
-        "NAME` runs one. Of a history, the difference is the largest over time as a share of the",
-        "reference's largest value.\n",
+        "`dolfinopt bench field` runs them and compares; `bench field all` includes the long ones,",
+        "`bench field NAME` runs one. Of a history, the difference is the largest over time as a",
+        "share of the reference's largest value.\n",
         "How the references were made: `benchmarks/reference/README.md`. To take part, see",
         "`benchmarks/README.md`.\n",
     ]

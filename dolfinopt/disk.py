@@ -11,7 +11,7 @@ import fcntl
 import io
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -105,6 +105,16 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     write_bytes(path, text.encode())
+
+
+def write_table(path: Path, header: Sequence[str], columns: Any, digits: int) -> None:
+    """Write columns (n,) or (n, k) of numbers as a CSV file, with so many digits."""
+    import numpy as np
+
+    table = np.column_stack(columns)
+    line = ",".join([f"%.{digits}g"] * len(header)) + "\n"
+    text = line * len(table) % tuple(table.ravel().tolist())
+    write_text(path, ",".join(header) + "\n" + text)
 
 
 def read_arrays(path: Path, remedy: str) -> dict[str, Any]:

@@ -22,6 +22,20 @@ class OutputError(RuntimeError):
     """
 
 
+class MissingLibrary(RuntimeError):
+    """A library that does not come with pip is not installed."""
+
+
+def line_of(error: BaseException | None) -> str:
+    """Return the line that tells of what the user can mend; "" of what needs a traceback."""
+    if isinstance(error, KeyboardInterrupt):
+        return ": ".join(["dolfinopt", "interrupted", *map(str, error.args)])
+    if isinstance(error, InputError | ConvergenceError | OutputError | MissingLibrary):
+        return f"dolfinopt: {error}"
+    missing = missing_package(error)
+    return f"dolfinopt: {missing}" if missing else ""
+
+
 def missing_package(error: BaseException | None) -> str:
     """Return what to say of a package that is not installed; "" if that is not the reason."""
     name = getattr(error, "name", None) if isinstance(error, ModuleNotFoundError) else None

@@ -530,7 +530,7 @@ class Model:
         filtered = self._prepared(result.filtered)[2] if result.filtered else None
         with together(self._world):
             for k, arm in arms.items():
-                arm.set_design(x_phys[k])
+                arm.state(x_phys[k])
         run = RankResult(
             **_fields(result),
             partition=partition,

@@ -23,11 +23,9 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.errors import (
-    ConvergenceError,
     InputError,
     OthersFailed,
-    OutputError,
-    missing_package,
+    line_of,
 )
 from dolfinopt.interrupt import INTERRUPTED
 
@@ -301,12 +299,8 @@ def _status(failure: BaseException | None) -> int:
 
 def _report(error: BaseException | None) -> None:
     """Print one line for what the user can mend, the whole traceback for what he cannot."""
-    if isinstance(error, KeyboardInterrupt):
-        print(": ".join(["dolfinopt", "interrupted", *map(str, error.args)]), file=sys.stderr)
-    elif isinstance(error, InputError | ConvergenceError | OutputError):
-        print(f"dolfinopt: {error}", file=sys.stderr)
-    elif missing := missing_package(error):
-        print(f"dolfinopt: {missing}", file=sys.stderr)
+    if line := line_of(error):
+        print(line, file=sys.stderr)
     elif isinstance(error, OSError) and error.errno in CLOSED:
         _give_up_output()
         print(f"dolfinopt: standard output: {error.strerror}", file=sys.stderr)

@@ -233,7 +233,7 @@ PLACES = [
     (gradients, LONE, frequency, "rigid_gradient", PERIOD),
     (gradients, LONE, static, "tip_gradient", TIP),
     (gradients, LONE, frequency, "period_gradient", FREQUENCY),
-    (choosing, LONE, arm.Arm, "set_design"),
+    (choosing, LONE, arm.Arm, "state"),
     (choosing, LONE, order_selection, "shape_integrals"),
     (choosing, 0, coordinates, "_distance"),
     (optimising, LONE, arm.Arm, "physical_designs"),

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.design_state import DesignState, InitialVectors, Kind, options, same_basis
+from dolfinopt.arms.design_state import DesignState, InitialVectors, Kind, same_basis
 from dolfinopt.density.contacts import Contacts, contacts_of
 from dolfinopt.density.filter import (
     HelmholtzFilter,
@@ -34,7 +34,7 @@ from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import Partition, on_root, sum_over_arms, together
 from dolfinopt.profiling import Profile
-from dolfinopt.reduction import Basis, Options
+from dolfinopt.reduction import Basis
 from dolfinopt.scene import load as scenes
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.responses import STATICS, needs_alone
@@ -264,10 +264,6 @@ class Arm:
             raise RuntimeError(f"arm {self.mesh.name!r} has no design yet: call state(x_phys)")
         return self._state
 
-    def set_design(self, x_phys: np.ndarray) -> None:
-        """Make `state(x_phys)` the current state."""
-        self.state(x_phys)
-
     def reduce(self, x_phys: np.ndarray) -> ShapeIntegrals:
         """Return the floating body of physical densities in [0, 1] (collective on the arm)."""
         return self.state(x_phys).body
@@ -379,13 +375,11 @@ class Arm:
         self.initial.basis = None
         self.initial.loaded.clear()
         if self.stiffening is not None:
-            self.stiffening, self._state = None, None
+            self.stiffening = None
+            if self._state is not None:  # of the same design the factor stays
+                self._state = replace(self._state, stiffened=self.stiffened)
 
     # -- measures ----------------------------------------------------------------------------
-
-    def options(self, num_modes: int) -> Options:
-        """Return what the scene tells the reduction method, with so many modes."""
-        return options(self.scene, num_modes)
 
     def volume_fraction(self, x_phys: np.ndarray) -> float:
         """Return the solid volume over the largest one (collective on the arm)."""

@@ -206,7 +206,7 @@ class DesignState:
     @cached_property
     def static_body(self) -> ShapeIntegrals:
         """The body in the static modes of its interfaces, which need no eigenproblem."""
-        elastic, static = self.elastic, self.elastic.constraint_modes()
+        elastic, static = self.elastic, self.elastic.constraint_modes
         none = np.empty((len(static.interior), 0))
         weighted = elastic.mass_times(static.field)
         basis = Basis(static.field, weighted, static.stiffness, np.eye(static.field.shape[2]), none)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -97,22 +97,22 @@ def read_case(file: Path) -> Case:
         raise InputError(f"{file}: {error}; a case is a TOML file") from None
 
 
-def chosen_cases(names: Iterable[str], everything: bool, records: bool = False) -> tuple[Case, ...]:
-    """Return the cases of these names; without names the quick ones, or `everything`.
+def chosen_cases(names: Sequence[str], records: bool = False) -> tuple[Case, ...]:
+    """Return the cases of these names; without names the quick ones, of "all" the long ones, too.
 
     Without records, cases that need some are left out. InputError: there is no such case.
     """
     known = {case.name: case for case in read_cases()}
+    if not names or list(names) == ["all"]:
+        possible = [case for case in known.values() if records or not case.records]
+        return tuple(case for case in possible if names or not case.long)
     for name in names:
         if name not in known:
-            raise InputError(f"--case {name}: no such case; expected {' | '.join(known)}")
+            expected = " | ".join(["all", *known])
+            raise InputError(f"bench field {name}: no such case; expected {expected}")
         if known[name].records and not records:
-            raise InputError(f"--case {name}: give --records DIR, {known[name].records}")
-    return tuple(known[name] for name in dict.fromkeys(names)) or tuple(
-        case
-        for case in known.values()
-        if (everything or not case.long) and (records or not case.records)
-    )
+            raise InputError(f"bench field {name}: give --records DIR, {known[name].records}")
+    return tuple(known[name] for name in dict.fromkeys(names))
 
 
 # -- what is compared ------------------------------------------------------------------------

@@ -1,11 +1,11 @@
-"""Machines out and robots in: `dolfinopt export`, also with --urdf, and `dolfinopt import`."""
+"""Machines out and robots in: `dolfinopt export` and `dolfinopt import`."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -47,76 +47,12 @@ if TYPE_CHECKING:
 KINDS = (".sid", ".sid.npz", ".fem")
 
 
-@click.command()
-@scene_argument
-@design_option
-@out_option("the bodies; default: results/SCENE-bodies")
-@overwrite_option
-@set_option
-@click.option(
-    "--urdf",
-    is_flag=True,
-    help="instead, with the folder of a finished run as SCENE: the robot that its scene was "
-    "imported from, with the run's links; default folder: SCENE/urdf",
-)
-@click.option(
-    "--state-space",
-    "instant",
-    type=float,
-    metavar="T",
-    help="instead: the machine linearised about its motion at T seconds, as A, B, C, D (.npz and "
-    ".mat); SCENE is a scene's file or the folder of a finished run; default folder: "
-    "RUN/state-space or results/SCENE-state-space",
-)
-@click.option(
-    "--below",
-    type=click.FloatRange(min=0.0, min_open=True),
-    metavar="HZ",
-    help="with --state-space: poles below this frequency hold 1 %; the arms take as many "
-    "coordinates as that needs; default: those of the scene",
-)
-@click.option(
-    "--before",
-    type=PATH,
-    metavar="DIR",
-    help="with --urdf: an earlier run of the robot, for a table and a page of both",
-)
-def export(
-    scene: Path,
-    design: Path | None,
-    out: Path | None,
-    overwrite: bool,
-    overrides: tuple[str, ...],
-    urdf: bool,
-    instant: float | None,
-    below: float | None,
-    before: Path | None,
+def _export_bodies(
+    scene: Path, out: Path | None, overwrite: bool, design: Path | None, overrides: tuple[str, ...]
 ) -> None:
-    """Write the reduced arms of SCENE for other multibody codes, or its linearised machine.
-
-    Each arm as standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem), with
-    geometric stiffness where simulation.stiffening is true, or "auto" and the motion asks for it.
-    With [[joints]] in space; of rigid arms the screen tells mass, centre and inertia.
-    """
-    if instant is not None:
-        if urdf or before is not None:
-            raise InputError("--state-space: expected no --urdf and no --before with it")
-        _export_state_space(scene, instant, below, design, out, overwrite, overrides)
-        return
-    if below is not None:
-        raise InputError("--below: expected --state-space with it")
-    if urdf:
-        if design is not None or overrides:
-            raise InputError("--urdf: expected no --design and no --set, they are the run's")
-        export_robot(scene, out, overwrite, before)
-        return
-    if before is not None:
-        raise InputError("--before: expected --urdf with it")
+    """Write the reduced arms of a scene."""
     if scene.is_dir():
-        raise InputError(
-            f"{scene}: a folder; name a scene file, or add --urdf for a robot's run, or "
-            "--state-space T"
-        )
+        raise InputError(f"{scene}: a folder; name a scene file, or add robot or state-space")
     world, loaded = load(scene, overrides)
     folder = out or Path("results") / f"{scene.stem}-bodies"
     from dolfinopt.exchange.mbdyn import write_fem
@@ -135,7 +71,7 @@ def export(
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, Profile()))
     with together(world):
         for k, arm in arms.items():
-            arm.set_design(x_phys[k])
+            arm.state(x_phys[k])
     decide_stiffening([loaded, *pose_scenarios(loaded)], partition, arms)
     exported = {k: _exported(arm, loaded.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
     bodies = gather_arms(partition, exported)
@@ -161,14 +97,16 @@ STATE_SPACE = ("state_space.npz", "state_space.mat")
 
 def _export_state_space(
     source: Path,
-    instant: float,
-    below: float | None,
-    design: Path | None,
     out: Path | None,
     overwrite: bool,
+    design: Path | None,
     overrides: tuple[str, ...],
+    at: float | None,
+    below: float | None,
 ) -> None:
     """Write a scene's machine, or a run's, linearised at an instant, s."""
+    if at is None:
+        raise InputError("--at: expected an instant, s, at which the machine is linearised")
     folder = out or Path("results") / f"{source.stem}-state-space"
     if source.is_dir():
         if design is not None:
@@ -182,13 +120,13 @@ def _export_state_space(
     from dolfinopt.responses.linearised_machine import linearised_machine
     from dolfinopt.responses.order_selection import choose_coordinates
 
-    check_instant(loaded, instant)
+    check_instant(loaded, at)
     claim(world, folder, overwrite, STATE_SPACE, scene=loaded)
     profile = Profile()
     loaded = on_root(world, under_law_of, loaded, design)
     partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
     tell(world, choose_coordinates(loaded, partition, arms, x_phys, profile))
-    model = linearised_machine(loaded, partition, arms, x_phys, instant, profile, below=below)
+    model = linearised_machine(loaded, partition, arms, x_phys, at, profile, below=below)
     prepare(world, folder)
     with together(world):
         if world.rank == 0:
@@ -282,7 +220,7 @@ def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
     return to_sid(body, title), modal_element(body, nodes)
 
 
-# -- robots: import, and export RUN --urdf ---------------------------------------------------
+# -- robots: import, and export RUN robot ----------------------------------------------------
 
 
 @click.command(name="import")
@@ -415,7 +353,7 @@ def _keep_edited(path: Path, text: str | bytes) -> None:
     click.echo(f"{kept}: the scene that was there")
 
 
-# -- `dolfinopt export RUN --urdf`: a robot with the links of a finished run ---------------------
+# -- `dolfinopt export RUN robot`: a robot with the links of a finished run ----------------------
 
 PAGES = ("before_after.md", "before_after.csv", "before_after.html")
 
@@ -653,3 +591,79 @@ def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
     own = Inertia(float(body.mass), *body.inertia_about_centre())
     motor = Inertia(arm.joint_mass, np.array([arm.length, 0.0, 0.0]), arm.joint_inertia * np.eye(3))
     return own + motor
+
+
+# -- `dolfinopt export`: what it writes ------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Format:
+    """What `dolfinopt export` writes, and the options that it takes besides --out, --overwrite."""
+
+    write: Callable[..., None]
+    options: tuple[str, ...]
+
+
+FORMATS = {
+    "bodies": Format(_export_bodies, ("design", "set")),
+    "robot": Format(export_robot, ("before",)),
+    "state-space": Format(_export_state_space, ("design", "set", "at", "below")),
+}
+
+
+@click.command()
+@scene_argument
+@click.argument("kind", type=click.Choice(list(FORMATS)), default="bodies", metavar="[WHAT]")
+@design_option
+@out_option("the files; default: results/SCENE-WHAT, or urdf or state-space in the folder of a run")
+@overwrite_option
+@set_option
+@click.option("--at", type=float, metavar="T", help="of state-space: instant, s")
+@click.option(
+    "--below",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="HZ",
+    help="of state-space: poles below this frequency hold 1 %; the arms take as many coordinates "
+    "as that needs; default: those of the scene",
+)
+@click.option(
+    "--before",
+    type=PATH,
+    metavar="DIR",
+    help="of robot: an earlier run of the robot, for a table and a page of both",
+)
+@click.option("--urdf", is_flag=True, hidden=True)  # older word of robot
+@click.option("--state-space", "instant", type=float, hidden=True)  # and of state-space --at
+def export(
+    scene: Path,
+    kind: str,
+    out: Path | None,
+    overwrite: bool,
+    overrides: tuple[str, ...],
+    urdf: bool,
+    instant: float | None,
+    **given: Any,
+) -> None:
+    """Write what other programs need of SCENE. WHAT is one of
+
+    \b
+      bodies       the reduced arms (default)
+      robot        of the folder of a finished run: the URDF robot that its
+                   scene was imported from, with the run's links
+      state-space  the machine linearised about its motion at --at T, as
+                   A, B, C, D (.npz, .mat); of a scene or a run's folder
+
+    Bodies are standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem), with
+    geometric stiffness where simulation.stiffening is true, or "auto" and the motion asks for it.
+    With [[joints]] in space; of rigid arms the screen tells mass, centre and inertia.
+    """
+    if urdf or instant is not None:
+        kind = "robot" if urdf else "state-space"
+        given["at"] = instant if given["at"] is None else given["at"]
+    given["set"] = overrides
+    chosen = FORMATS[kind]
+    for name, value in given.items():
+        if value not in (None, ()) and name not in chosen.options:
+            users = " or ".join(word for word, one in FORMATS.items() if name in one.options)
+            raise InputError(f"--{name}: expected with {users}, not with {kind}")
+    chosen.write(scene, out, overwrite, *(given[name] for name in chosen.options))

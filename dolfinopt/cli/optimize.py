@@ -16,6 +16,7 @@ from dolfinopt.cli.shared import (
     design_option,
     draw,
     elapsed,
+    in_words,
     load,
     out_option,
     overwrite_option,
@@ -83,14 +84,15 @@ def optimize(
         _tell_ahead(world, loaded)
     with working_alone(world, folder):  # until all files of the run are written
         try:
-            with progress(world, loaded) as report:
+            with progress(world) as say:
+                most = loaded.optimizer.max_iterations
                 result = run(
                     loaded,
                     folder,
                     resume=resume,
                     overwrite=overwrite,
                     world=world,
-                    report=report,
+                    report=lambda row: say(in_words(row, most)),
                     compared=True,
                 )
         except KeyboardInterrupt:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import signal
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,11 +13,13 @@ import click
 
 from dolfinopt.cli.shared import (
     PATH,
+    Say,
     claim,
     elapsed,
     out_option,
     overwrite_option,
     plots_option,
+    progress,
     scene_of,
     start,
     warn,
@@ -26,16 +27,12 @@ from dolfinopt.cli.shared import (
 from dolfinopt.errors import ConvergenceError, InputError
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
     from dolfinopt.part.check import Check
     from dolfinopt.part.folder import Saved
     from dolfinopt.part.optimize import Keep, Optimized
     from dolfinopt.part.part import Meshes, Part
     from dolfinopt.scene.load import Scene
     from dolfinopt.scene.tables.design import Part as Asked
-
-Say = Callable[[str], None]
 
 
 @click.command()
@@ -50,8 +47,8 @@ Say = Callable[[str], None]
     metavar="M",
     help="how far sides may lie from the outline of the densities; default: half a cell",
 )
-@click.option("--curves", type=click.Choice(["splines", "arcs"]), hidden=True)  # no effect
-@click.option("--simplify/--no-simplify", default=None, hidden=True)  # no effect
+@click.option("--curves", hidden=True, expose_value=False)  # of splines: no effect
+@click.option("--simplify/--no-simplify", hidden=True, expose_value=False)  # no effect
 @click.option("--round", "rounds", is_flag=True, help="radii of whole half millimetres")
 @click.option(
     "--check/--no-check",
@@ -79,8 +76,6 @@ def part(
     out: Path | None,
     tool_radius: float | None,
     tolerance: float | None,
-    curves: str | None,
-    simplify: bool | None,
     rounds: bool,
     check: bool,
     optimize: bool | None,
@@ -114,19 +109,21 @@ def part(
     scene: Scene = on_root(world, scene_of, folder, overrides)
     target = out or folder / "part"
     scene.check_designed()
-    given = {"tool_radius": tool_radius, "tolerance": tolerance, "curves": curves,
-             "simplify": simplify, "optimize": optimize, "iterations": iterations,
-             "starts": starts}  # fmt: skip
+    given = {
+        "tool_radius": tool_radius,
+        "tolerance": tolerance,
+        "optimize": optimize,
+        "iterations": iterations,
+        "starts": starts,
+    }
     asked = scene.part.unchecked_copy({k: v for k, v in given.items() if v is not None})
-    if world.rank == 0 and (asked.curves != "splines" or asked.simplify):
-        warn(["part.curves and part.simplify have no effect: parts have lines, arcs and circles"])
     if resume and not asked.optimize:
         raise InputError("--resume: goes on with --optimize, which is not asked for")
     names = [*file_names(scene), SHAPES]
     claim(world, target, overwrite or resume, names, resume=SHAPES, scene=scene)
     kept = on_root(world, checkpoint_of_search, target, folder, scene, asked)
     known = on_root(world, kept.read) if resume else ()
-    with _stages(world) as say:
+    with progress(world) as say:
         say("outlines and surfaces")
         wanted = Curves(asked.tool_radius, asked.tolerance, rounds)
         try:
@@ -157,21 +154,6 @@ def part(
             raise KeyboardInterrupt(
                 f"the best parts so far are in {target}; to go on, add --resume"
             )
-
-
-@contextmanager
-def _stages(world: MPI.Comm) -> Iterator[Say]:
-    """Yield a function that shows what is being done, on the root's terminal."""
-    if world.rank != 0:
-        yield lambda _: None
-        return
-    if not sys.stderr.isatty():
-        yield lambda stage: click.echo(f"{elapsed():.1f} s: {stage}", err=True)
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status("") as status:
-        yield lambda stage: status.update(f"{elapsed():.1f} s: {stage}")
 
 
 @contextmanager
@@ -313,21 +295,18 @@ class Made:
 
 def tell(check: Check) -> None:
     """Print the table of a check and what it says."""
-    from rich.console import Console
-    from rich.table import Table
+    from pandas import DataFrame
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
     against = "part/density" if check.crisp is None else "part/crisp"
     figures = check.table()
     forms = [name for name in figures.columns if name != "unit" and "/" not in name]
-    for name in ("", *forms, "unit", against):
-        table.add_column(name, justify="left" if name in ("", "unit") else "right")
-    for name, row in figures.iterrows():
-        values = [f"{row[form]:.4g}" for form in forms]
-        ratio = f"{100.0 * row[against]:+.2f} %"
-        cells = [str(name).replace("_", " "), *values, row["unit"], ratio]
-        table.add_row(*("-" if "nan" in cell else cell for cell in cells))
-    Console(highlight=False, width=None if sys.stdout.isatty() else 100).print(table)
+    rows = [
+        [*(f"{row[form]:.4g}" for form in forms), row["unit"], f"{100.0 * row[against]:+.2f} %"]
+        for _, row in figures.iterrows()
+    ]
+    names = [str(name).replace("_", " ") for name in figures.index]
+    cells = [["-" if "nan" in cell else cell for cell in row] for row in rows]
+    click.echo(DataFrame(cells, names, [*forms, "unit", against]).to_string())
     for line in (check.loss, *check.notes):
         click.echo(line)
     for limit in check.part.limits:

@@ -177,11 +177,14 @@ def _details(summary: Summary) -> Iterator[str]:
 
 def _next(result: Result, summary: Summary, folder: Path) -> str:
     """Return how to go on from a design."""
-    scene = result.scene
+    scene, made = result.scene, result.scene.optimizer.max_iterations
+    more = 2 * made or type(scene.optimizer)().max_iterations
     longer = (
         f"dolfinopt optimize {scene.source} --out {folder} --resume "
-        f"--set optimizer.max_iterations={2 * max(1, scene.optimizer.max_iterations)}"
+        f"--set optimizer.max_iterations={more}"
     )
+    if made == 0:
+        return f"next: {longer}"
     if result.violated:
         spent = result.stop_code is StopCode.ITERATIONS
         return "next: relax a limit" + f", or go on with {longer}" * spent

@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 import threading
 import time
 import traceback
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import (
-    AbstractContextManager,
-    ExitStack,
-    contextmanager,
-    nullcontext,
-    redirect_stdout,
-)
+from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import partial
 from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from dolfinopt.errors import ConvergenceError, InputError, OutputError, missing_package
+from dolfinopt.errors import ConvergenceError, InputError, MissingLibrary, line_of
 from dolfinopt.interrupt import (
     INTERRUPTED,
     end_at_once,
@@ -209,35 +203,12 @@ def chosen(coordinates: int, error: float) -> str:
     )
 
 
-def progress(
-    world: MPI.Comm, scene: Scene
-) -> AbstractContextManager[Callable[[HistoryRow], None] | None]:
-    """Return a live line on the root's terminal, lines every few seconds where it has none."""
-    if world.rank != 0:
-        return nullcontext(None)
-
-    shown = live_line if sys.stderr.isatty() else plain_lines
-    return shown(scene.optimizer.max_iterations)
+BEGUN = time.perf_counter()
 
 
 def elapsed() -> float:
-    """Return the seconds that the user has waited: since the process was started."""
+    """Return the seconds since the command line began."""
     return time.perf_counter() - BEGUN
-
-
-def _age() -> float:
-    """Return how long ago this process was started, s; 0 where the system does not tell."""
-    # The launcher's process becomes this one after its set-up, which does not count.
-    try:
-        words = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        age = time.clock_gettime(time.CLOCK_BOOTTIME) - int(words[19]) / os.sysconf("SC_CLK_TCK")
-        age = min(age, time.time() - float(os.environ.get("DOLFINOPT_STARTED", "-inf")))
-    except (OSError, ValueError, IndexError, AttributeError):
-        return 0.0
-    return age if 0.0 <= age < 600.0 else 0.0  # imports do not take longer: another clock
-
-
-BEGUN = time.perf_counter() - _age()
 
 
 # -- options that several commands have ----------------------------------------------------------
@@ -307,10 +278,6 @@ def out_option(what: str) -> Callable[..., Any]:
 # them. A launcher's ranks then know one another only by the environment.
 
 NEEDED = ("petsc4py", "slepc4py", "mpi4py", "dolfinx", "gmsh")
-
-
-class MissingLibrary(RuntimeError):
-    """A library that does not come with pip is not installed."""
 
 
 class Start:
@@ -383,87 +350,64 @@ def end_before_start(error: BaseException) -> int:
     told_by_another = (launched_rank() or 0) > 0
     if isinstance(error, InputError | ConvergenceError | KeyboardInterrupt) and told_by_another:
         return 0
-    if isinstance(error, KeyboardInterrupt):
-        print(": ".join(["dolfinopt", "interrupted", *map(str, error.args)]), file=sys.stderr)
-        return INTERRUPTED
-    if isinstance(error, InputError | ConvergenceError | OutputError | MissingLibrary):
-        print(f"dolfinopt: {error}", file=sys.stderr)
-    elif missing := missing_package(error):
-        print(f"dolfinopt: {missing}", file=sys.stderr)
+    if line := line_of(error):
+        print(line, file=sys.stderr)
     else:
         traceback.print_exception(error)
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
     return 2 if isinstance(error, InputError) else 1
 
 
-# -- how far an optimisation is: a live line on a terminal, a line every few seconds elsewhere ---
+# -- how far a command is: one line, in its place on a terminal, every few seconds elsewhere -----
+
+Say = Callable[[str], None]
+REDRAWN = 0.2  # s from one look of a terminal's line to the next
 
 
-WIDE = 110  # characters a line
+@contextmanager
+def progress(world: MPI.Comm, every: float = 5.0) -> Iterator[Say]:
+    """Yield a function that takes what is being done; the root shows it on the standard error.
+
+    A thread prints, so that long work is not silent either.
+
+    Args:
+        world: all ranks.
+        every: s from one line to the next, where there is no terminal.
+    """
+    if world.rank != 0:
+        yield lambda _: None
+        return
+    live, ended, last = sys.stderr.isatty(), threading.Event(), ["setting up"]
+
+    def run() -> None:
+        while not ended.wait(REDRAWN if live else every):
+            line = f"{last[0]}, {elapsed():.0f} s"
+            if live:  # what else is printed begins where the line does
+                print(f"{line[: get_terminal_size().columns - 1]}\x1b[K", end="\r", file=sys.stderr)
+            else:
+                print(line, file=sys.stderr)
+            sys.stderr.flush()
+
+    def say(words: str) -> None:
+        last[0] = words
+
+    thread = threading.Thread(target=run, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield say
+    finally:
+        ended.set()
+        thread.join()
+        if live:
+            print("\x1b[K", end="", file=sys.stderr, flush=True)
 
 
-def _words(row: HistoryRow, iterations: int) -> str:
-    """Return a row of the history in words."""
+def in_words(row: HistoryRow, iterations: int) -> str:
+    """Return a row of the history of a run of at most so many iterations."""
     return (
         f"{row.iteration}/{iterations} objective {row.objective:.4g} "
         f"dev {1e3 * row.max_deviation:.3g} mm gray {row.grayness:.3f} "
         f"vol {row.volume_fraction:.4f} change {row.change:.4f}"
         + (f", {row.tightest}" if row.tightest else "")
     )
-
-
-@contextmanager
-def plain_lines(iterations: int, every: float = 5.0) -> Iterator[Callable[[HistoryRow], None]]:
-    """Yield a function that takes a history row; print the last one every few seconds.
-
-    A thread prints, so that a single long iteration is not silent either.
-
-    Args:
-        iterations: at most.
-        every: s from one line on standard error to the next.
-    """
-    begun, ended = time.monotonic(), threading.Event()
-    last = ["setting up"]
-
-    def run() -> None:
-        while not ended.wait(every):
-            line = f"{last[0]}, {time.monotonic() - begun:.0f} s"
-            print(line, file=sys.stderr, flush=True)
-
-    def show(row: HistoryRow) -> None:
-        last[0] = _words(row, iterations)
-
-    thread = threading.Thread(target=run, name="progress", daemon=True)
-    thread.start()
-    try:
-        yield show
-    finally:
-        ended.set()
-        thread.join()
-
-
-@contextmanager
-def live_line(iterations: int) -> Iterator[Callable[[HistoryRow], None]]:
-    """Yield a function that shows a history row: figures, bar, and time left.
-
-    The time left assumes all `iterations`; convergence may end the run before.
-    """
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeRemainingColumn
-    from rich.table import Column
-
-    console = Console(stderr=True)
-    # Eighty characters hold the figures; a bar wants more.
-    columns: list[ProgressColumn] = [
-        TextColumn("{task.description}", table_column=Column(no_wrap=True)),
-        TimeRemainingColumn(compact=True),
-    ]
-    if console.width >= WIDE:
-        columns.insert(1, BarColumn(bar_width=None))
-    with Progress(*columns, console=console, expand=console.width >= WIDE) as progress:
-        task = progress.add_task("setting up", total=iterations)
-
-        def show(row: HistoryRow) -> None:
-            words = _words(row, iterations)
-            progress.update(task, completed=row.iteration, description=words)
-
-        yield show

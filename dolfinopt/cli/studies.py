@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,7 @@ from dolfinopt.cli.shared import (
     overwrite_option,
     plots_option,
     prepare,
+    progress,
     scene_argument,
     set_option,
     start,
@@ -171,11 +171,6 @@ def sweep(
     whatever --vary names. What is computed is kept in DIR: a sweep that was interrupted, or that
     grows, takes it from there.
     """
-    if preset is None and not vary:
-        raise InputError(
-            "sweep: name payload, flattening or coordinates, or what to --vary "
-            "(see dolfinopt sweep --help)"
-        )
     from dolfinopt.study.studies import study, sweep_name
 
     do = partial(study, scene, preset, vary, designs, reoptimize=reoptimize)
@@ -192,8 +187,6 @@ def sweep(
     help="any number of times: of the objectives a kind, by default all; of the reductions a "
     "number of coordinates, by default 4 and 12",
 )
-@click.option("--coordinates", multiple=True, hidden=True)
-@click.option("--kind", "kinds", multiple=True, hidden=True)
 @click.option(
     "--design",
     "designs",
@@ -207,8 +200,6 @@ def compare(
     scene: Scene,
     what: str,
     only: tuple[str, ...],
-    coordinates: tuple[str, ...],
-    kinds: tuple[str, ...],
     designs: tuple[Path, ...],
 ) -> Question:
     """Optimise SCENE for every objective or with every reduction, and compare the designs.
@@ -222,14 +213,6 @@ def compare(
     """
     if only and what in (SECTIONS, MOTIONS):
         raise InputError("--only: expected only with compare SCENE objectives or reductions")
-    coordinates += only if what == "reductions" else ()
-    kinds += only if what == "objectives" else ()
-    if designs and what not in (SECTIONS, MOTIONS):
-        raise InputError("--design: expected only with compare SCENE sections or motions")
-    if coordinates and what != "reductions":
-        raise InputError("--coordinates: expected only with compare SCENE reductions")
-    if kinds and what != "objectives":
-        raise InputError("--kind: expected only with compare SCENE objectives")
     if what == SECTIONS:
         from dolfinopt.study.sections import NAME, study_sections
 
@@ -241,8 +224,9 @@ def compare(
     from dolfinopt.study.studies import study
 
     preset: Any = COMPARED[what]
-    vary = [f"reduction.coordinates={','.join(map(str, coordinates))}"] if coordinates else []
-    return preset, [], partial(study, scene, preset, vary, [], kinds=kinds), {}
+    vary = [f"reduction.coordinates={','.join(only)}"] if only and what == "reductions" else []
+    kinds = only if what == "objectives" else ()
+    return preset, designs, partial(study, scene, preset, vary, designs, kinds=kinds), {}
 
 
 @click.command()
@@ -336,17 +320,9 @@ FIELD = "field"
 
 
 @click.command()
-@click.argument("names", metavar="[DIAGRAM]...", nargs=-1)
+@click.argument("names", metavar="[DIAGRAM... | field [CASE...]]", nargs=-1)
 @out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
 @click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
-@click.option(
-    "--case",
-    "cases",
-    metavar="NAME",
-    multiple=True,
-    help='of field: this case alone; "all": the long ones, too',
-)
-@click.option("--all", "everything", is_flag=True, hidden=True)
 @click.option(
     "--records", type=PATH, metavar="DIR", help="of field: measured records that a case reads"
 )
@@ -354,8 +330,6 @@ def bench(
     names: tuple[str, ...],
     out: Path | None,
     quick: bool,
-    cases: tuple[str, ...],
-    everything: bool,
     records: Path | None,
 ) -> None:
     """Measure run time against error, or check the benchmark of the field.
@@ -369,41 +343,32 @@ def bench(
 
     `dolfinopt bench field` runs the published problems of the folder benchmarks and prints every
     value beside its reference, with difference, limit and verdict; exit status 1 where a limit is
-    missed. By default the quick cases, some ten seconds; with --records DIR those, too, that read
-    measured records which cannot be copied: ur10e.
+    missed. By default the quick cases, some ten seconds; those named alone; "all" with the long
+    ones; with --records DIR those, too, that read measured records which cannot be copied: ur10e.
     """
     world = start()
-    if cases == ("all",):
-        cases, everything = (), True
-    if FIELD in names:
-        if len(names) > 1 or quick:
-            other = "--quick" if quick else next(name for name in names if name != FIELD)
-            raise InputError(f"bench field: {other} does not go with it; call it alone")
-        _check_field(world, out, cases, everything, records)
+    if names[:1] == (FIELD,):
+        if quick:
+            raise InputError("bench field: --quick does not go with it")
+        _check_field(world, out, names[1:], records)
         return
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    if cases or everything or records:
-        raise InputError("bench: --case and --records belong to dolfinopt bench field")
+    if records:
+        raise InputError("bench: --records belongs to dolfinopt bench field")
     _measure(names, out, quick)
 
 
 def _check_field(
-    world: MPI.Comm,
-    out: Path | None,
-    names: tuple[str, ...],
-    everything: bool,
-    records: Path | None,
+    world: MPI.Comm, out: Path | None, names: tuple[str, ...], records: Path | None
 ) -> None:
     """Run cases of the benchmark on the root; print each one's values when it is done."""
     from dolfinopt.bench.field import check, chosen_cases, table_of
     from dolfinopt.disk import write_text
     from dolfinopt.parallel import on_root
 
-    if names and everything:
-        raise InputError('bench field: --case: expected names, or "all" alone')
     found = []
-    for case in chosen_cases(names, everything, records is not None):
+    for case in chosen_cases(names, records is not None):
         checked = on_root(world, check, case, records)
         found += checked
         if world.rank == 0:
@@ -432,33 +397,9 @@ def _measure(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     folder = out or Path("results") / "bench"
     prepare(world, folder)
     plan = Plan(load_paper(overrides=QUICKLY if quick else ()), quick)
-    with _progress(len(chosen)) as (tell, done):
-        failures = run(plan, folder, chosen, tell, done)
+    with progress(world) as say:
+        failures = run(plan, folder, chosen, say, partial(click.echo, err=True))
     seconds = time.perf_counter() - begun
     click.echo(f"diagrams in {folder}, summary in {folder / 'bench.md'}; {seconds:.0f} s")
     if failures:
         raise ConvergenceError("; ".join(failures))
-
-
-@contextmanager
-def _progress(count: int) -> Iterator[tuple[Callable[[str], None], Callable[[str], None]]]:
-    """Yield what shows a step on a live line, or prints it, and what prints a finished diagram."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True, highlight=False, markup=False)
-
-    def line(text: str) -> None:
-        console.print(text, soft_wrap=True)
-
-    if not console.is_terminal:
-        yield line, line
-        return
-    with Progress(console=console, transient=True) as progress:
-        task = progress.add_task("starting", total=count)
-
-        def done(text: str) -> None:
-            line(text)
-            progress.advance(task)
-
-        yield lambda text: progress.update(task, description=text.replace("[", r"\[")), done

@@ -13,12 +13,11 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from dolfinopt.mesh.checks import edge_corners
+
 WORST = 3  # contacts whose places are told
 ROUNDS = 20  # of opening contacts: a cell that is taken away may leave another contact
 MANY = 1000  # contacts, of a chequerboard say, beyond which none is opened
-# Edges of a cell in space by its corners, in the order of the finite elements.
-TETRAHEDRON = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
-HEXAHEDRON = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +74,12 @@ def contacts_of(
     nodes = nodes.reshape(at.size, -1)
     at, nodes = (one[np.lexsort(np.sort(nodes, axis=1).T)] for one in (at, nodes))
     mesh = _Solid(points, nodes, held[at], volume[at])
-    corner, edge = mesh.contacts(np.ones(at.size, dtype=bool))
+    corner, edge = mesh.contacts(mesh.every)
     kept, joins = mesh.opened()
     found = np.zeros_like(solid)
     found[at[kept]] = True
     return Contacts(
-        pieces=len(np.unique(mesh.pieces(np.ones(at.size, dtype=bool)))),
+        pieces=len(np.unique(mesh.pieces(mesh.every))),
         corners=len(corner),
         edges=len(edge),
         places=mesh.worst([*edge, *corner]),
@@ -98,6 +97,7 @@ class _Solid:
         """Take points (p, d), nodes and interfaces (n, k), volumes (n,)."""
         self.points, self.nodes, self.volume = points, nodes, volume
         (n, k), d = nodes.shape, points.shape[1]
+        self.every = np.ones(n, dtype=bool)
         incidence = sp.csr_matrix(
             (np.ones(n * k), nodes.ravel(), np.arange(0, n * k + 1, k)), (n, len(points))
         )
@@ -116,7 +116,7 @@ class _Solid:
         self.rigid[nodes[held > 0]] = True
         self.edges = np.zeros((n, 0), dtype=int)
         if d == 3:
-            first, second = nodes[:, TETRAHEDRON if k == 4 else HEXAHEDRON].transpose(2, 0, 1)
+            first, second = nodes[:, edge_corners(d, k)].transpose(2, 0, 1)
             self.edges = np.minimum(first, second) * len(points) + np.maximum(first, second)
 
     def pieces(self, kept: np.ndarray) -> np.ndarray:
@@ -138,7 +138,7 @@ class _Solid:
 
     def opened(self) -> tuple[np.ndarray, bool]:
         """Return the cells (n,) that are kept, and whether they join all interfaces."""
-        kept, joins = self._joined(np.ones(len(self.nodes), dtype=bool))
+        kept, joins = self._joined(self.every)
         for _ in range(ROUNDS):
             before, found = kept.copy(), [one for kind in self.contacts(kept) for one in kind]
             for groups in found if len(found) <= MANY else ():
@@ -180,7 +180,7 @@ class _Solid:
 
     def worst(self, found: Sequence[list[np.ndarray]]) -> np.ndarray:
         """Return the places (k, d) of those contacts that join the largest pieces, m."""
-        number = self.pieces(np.ones(len(self.nodes), dtype=bool))
+        number = self.pieces(self.every)
         volume = np.bincount(number, self.volume)
         rank = []
         for groups in found:

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.density.measured import LEAST_SIDE_DISTANCE, MIRROR_DISTANCE_LIMIT
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh, interior_facets
+from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.checks import cell_centroids, facet_areas, facet_corners, facet_middles
 from dolfinopt.mesh.measured import FILE_ROUNDING_SHARE
 from dolfinopt.scene.load import Arm
@@ -36,19 +36,24 @@ class HelmholtzFilter:
     a cell, also for r = 0.
 
     - Constants and the volume are kept, and r = 0 is the identity, on any mesh.
-    - The matrix is symmetric: y = A^-1 V x with cell areas V, and the transpose is V A^-1.
-    - Where every cell is a rectangle or an equilateral triangle the facets' values drop out and
-      leave the two-point flux, length / distance of centroids; A is then an M-matrix, so that y
-      keeps the bounds of x. On other meshes (where the two-point flux alone is inconsistent: on
-      right-angled triangles its second moments are 0.71 and 1.33 of the cone's at any refinement)
-      y may leave them next to a jump, the more the smaller r is beside the cells; see
-      `Arm.filtered` for what becomes of it.
+    - The matrix is symmetric: y = F V x with cell areas V, and the transpose is V F.
+    - Where every cell is a rectangle or an equilateral triangle the fluxes are those of two points,
+      length / distance of centroids, and y keeps the bounds of x. On other meshes (where the
+      two-point flux alone is inconsistent: on right-angled triangles its second moments are 0.71
+      and 1.33 of the cone's at any refinement) y may leave them next to a jump, the more the
+      smaller r is beside the cells; see `Arm.filtered` for what becomes of it.
 
     No flux passes through the boundary; or, with `open_edges`, r dy/dn = -y on all of it but the
     interfaces: what the filter gives when the void goes on beyond the edges. Source: Wallin,
     Ivarsson, Amir & Tortorelli, Struct. Multidisc. Optim. 62 (2020) 1299-1311,
     doi:10.1007/s00158-020-02556-w. Constants and the volume are then not kept near the edges.
     """
+
+    # Fluxes out of a cell are r^2 W (1 y - u), with W = area G'G + S' diag(length / distance) S of
+    # the gradient G = N' / area exact for linear fields, and what G leaves over, S = I - arm G.
+    # From area y + r^2 1'W (1 y - u) = area x follows y = keep x + c'u, with
+    # c = r^2 W1 / (area + r^2 1'W1), keep = area / (area + r^2 1'W1); fluxes into a facet add up to
+    # none. Thus y = keep x + C A^-1 C' area x with A = sum r^2 W - (area + r^2 1'W1) c c'.
 
     def __init__(self, mesh: ArmMesh, radius: float, open_edges: bool = False):
         """Assemble and factorise once; a radius of 0 costs nothing (collective on the arm).
@@ -58,23 +63,61 @@ class HelmholtzFilter:
             radius: of the equivalent cone, m.
             open_edges: see above.
         """
-        self.keeps_bounds = True
-        self._scheme: _TwoPoint | _Hybrid | None = None
+        self.keeps_bounds, self._area = True, mesh.area
+        self._solver: PETSc.KSP | None = None
         if radius <= 0.0:
             return
         r = radius / (2.0 * np.sqrt(3.0))
         sides = _sides(mesh, open_edges)
         skew = mesh.comm.allgather(float(sides.skew.max(initial=0.0)))
         self.keeps_bounds = max(skew) <= FILE_ROUNDING_SHARE
-        self._scheme = (_TwoPoint if self.keeps_bounds else _Hybrid)(mesh, sides, r)
+        W = r * r * _fluxes(sides)
+        flux = W.sum(axis=2)
+        whole = sides.area + flux.sum(axis=1)
+        self._keep, c = sides.area / whole, flux / whole[:, None]
+        A = W - whole[:, None, None] * c[:, :, None] * c[:, None, :]
+        every = np.arange(sides.facet.shape[1])
+        A[:, every, every] += np.where(sides.open, r * sides.length, 0.0)
+        facets = mesh.mesh.topology.index_map(mesh.dim - 1)
+        number = facets.local_to_global(sides.facet.ravel().astype(np.int32))
+        number = number.astype(PETSc.IntType).reshape(sides.facet.shape)
+        self._C = _matrix(mesh, c[:, None, :], np.arange(mesh.num_cells)[:, None], number)
+        matrix = _matrix(mesh, A, number, number)
+        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        matrix.setOption(PETSc.Mat.Option.SPD, True)
+        self._solver = _solver(mesh, matrix)
+        self._y, self._u = self._C.createVecLeft(), self._C.createVecRight()
+        self._b = self._u.duplicate()
 
     def forward(self, x: np.ndarray) -> np.ndarray:
         """Return the filtered field of owned cells (n_cells,) (collective on the arm)."""
-        return x.copy() if self._scheme is None else self._scheme.forward(x)
+        if self._solver is None:
+            return x.copy()
+        return self._keep * x + self._spread(self._solver, self._area * x)
 
     def backward(self, slope: np.ndarray) -> np.ndarray:
         """Return the derivative with respect to x, given that with respect to the filtered x."""
-        return slope.copy() if self._scheme is None else self._scheme.backward(slope)
+        if self._solver is None:
+            return slope.copy()
+        return self._keep * slope + self._area * self._spread(self._solver, slope)
+
+    def _spread(self, solver: PETSc.KSP, values: np.ndarray) -> np.ndarray:
+        """Return C A^-1 C' values; InputError with PETSc options of the user (collective).
+
+        Raises:
+            ConvergenceError: conjugate gradients do not converge.
+        """
+        self._y.array = values
+        self._C.multTranspose(self._y, self._b)
+        with obeying_options(solver.getOptionsPrefix()):
+            solver.solve(self._b, self._u)
+        if solver.getConvergedReason() < 0:
+            raise ConvergenceError(
+                "the filter's linear system is not solved: its conjugate gradients do not converge;"
+                " take a smaller design.filter_radius, or a mesh of less distorted cells"
+            )
+        self._C.mult(self._u, self._y)
+        return self._y.array_r.copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,103 +169,12 @@ def _open(mesh: ArmMesh, facet: np.ndarray, open_edges: bool) -> np.ndarray:
     return (count[owned] == 1) & ~np.isin(owned, mesh.interface_facets)
 
 
-class _TwoPoint:
-    """A = V + r^2 L, L_ij = -length_ij / distance_ij of the facets between owned cells."""
-
-    # An open side adds r^2 length / (distance + r) to the diagonal.
-
-    def __init__(self, mesh: ArmMesh, sides: _Sides, r: float):
-        self.area = mesh.area
-        leak = np.where(sides.open, r * r * sides.length / (sides.distance + r), 0.0).sum(axis=1)
-        matrix = _two_point_operator(mesh, r, leak)
-        self._solver = _solver(mesh, matrix)
-        self._b, self._x = matrix.createVecs()
-
-    def forward(self, x: np.ndarray) -> np.ndarray:
-        return self._solve(self.area * x)
-
-    def backward(self, slope: np.ndarray) -> np.ndarray:
-        return self.area * self._solve(slope)
-
-    def _solve(self, right: np.ndarray) -> np.ndarray:
-        self._b.array = right
-        _solve(self._solver, self._b, self._x)
-        return self._x.array_r.copy()
-
-
-def _two_point_operator(mesh: ArmMesh, r: float, leak: np.ndarray) -> PETSc.Mat:
-    owned = mesh.num_cells
-    first, second, length, distance = interior_facets(mesh.mesh)
-    here, there = np.concatenate([first, second]), np.concatenate([second, first])
-    flux = np.tile(r * r * length / distance, 2)
-    mine = here < owned
-    here, there, flux = here[mine], there[mine], flux[mine]
-    cells = mesh.mesh.topology.index_map(mesh.mesh.topology.dim)
-    start = cells.local_range[0]
-    own = np.arange(owned)
-    # Ghost neighbours give columns of other ranks; the diagonal collects all fluxes of a row.
-    matrix = sp.csr_matrix(
-        (
-            np.concatenate([mesh.area + np.bincount(here, flux, owned) + leak, -flux]),
-            (
-                np.concatenate([own, here]),
-                np.concatenate([start + own, cells.local_to_global(there.astype(np.int32))]),
-            ),
-        ),
-        shape=(owned, cells.size_global),
-    )
-    matrix.sort_indices()
-    csr = (matrix.indptr.astype(PETSc.IntType), matrix.indices.astype(PETSc.IntType), matrix.data)
-    mat = PETSc.Mat().createAIJ(((owned, None), (owned, None)), csr=csr, comm=mesh.comm)
-    return _positive_definite(mat)
-
-
-class _Hybrid:
-    """Values u in the facets, from which those in the cells follow."""
-
-    # Fluxes out of a cell are r^2 W (1 y - u), with W = area G'G + S' diag(length / distance) S of
-    # the gradient G = N' / area exact for linear fields, and what G leaves over, S = I - arm G.
-    # From area y + r^2 1'W (1 y - u) = area x follows y = keep x + c'u, with
-    # c = r^2 W1 / (area + r^2 1'W1), keep = area / (area + r^2 1'W1); fluxes into a facet add up to
-    # none. Thus y = keep x + C A^-1 C' area x with A = sum r^2 W - (area + r^2 1'W1) c c'.
-
-    def __init__(self, mesh: ArmMesh, sides: _Sides, r: float):
-        self.area = mesh.area
-        size = sides.facet.shape[1]
-        scaled = sides.normal * sides.length[..., None]
-        G = np.einsum("nki->nik", scaled) / sides.area[:, None, None]
-        S = np.eye(size) - sides.arm @ G
-        W = sides.area[:, None, None] * (np.einsum("nik->nki", G) @ G)
-        W += np.einsum("nki,nk,nkj->nij", S, sides.length / sides.distance, S)
-        W *= r * r
-        flux = W.sum(axis=2)
-        whole = self.area + flux.sum(axis=1)
-        self.keep = self.area / whole
-        c = flux / whole[:, None]
-        A = W - whole[:, None, None] * c[:, :, None] * c[:, None, :]
-        A[:, np.arange(size), np.arange(size)] += np.where(sides.open, r * sides.length, 0.0)
-        facets = mesh.mesh.topology.index_map(mesh.dim - 1)
-        number = facets.local_to_global(sides.facet.ravel().astype(np.int32))
-        number = number.astype(PETSc.IntType).reshape(sides.facet.shape)
-        self._C = _matrix(mesh, c[:, None, :], np.arange(mesh.num_cells)[:, None], number)
-        self._A = _positive_definite(_matrix(mesh, A, number, number))
-        self._solver = _solver(mesh, self._A)
-        self._y, self._u = self._C.createVecLeft(), self._C.createVecRight()
-        self._b = self._u.duplicate()
-
-    def forward(self, x: np.ndarray) -> np.ndarray:
-        return self.keep * x + self._spread(self.area * x)
-
-    def backward(self, slope: np.ndarray) -> np.ndarray:
-        return self.keep * slope + self.area * self._spread(slope)
-
-    def _spread(self, values: np.ndarray) -> np.ndarray:
-        """Return C A^-1 C' values."""
-        self._y.array = values
-        self._C.multTranspose(self._y, self._b)
-        _solve(self._solver, self._b, self._u)
-        self._C.mult(self._u, self._y)
-        return self._y.array_r.copy()
+def _fluxes(sides: _Sides) -> np.ndarray:
+    """Return W (n, k, k): fluxes W (1 y - u) out of cells with y, with u in their sides."""
+    scaled = sides.normal * sides.length[..., None]
+    G = scaled.swapaxes(1, 2) / sides.area[:, None, None]
+    S = np.eye(sides.facet.shape[1]) - sides.arm @ G
+    return scaled @ G + np.einsum("nki,nk,nkj->nij", S, sides.length / sides.distance, S)
 
 
 def _matrix(mesh: ArmMesh, blocks: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> PETSc.Mat:
@@ -259,26 +211,9 @@ def _solver(mesh: ArmMesh, matrix: PETSc.Mat) -> PETSc.KSP:
     prefix = "dolfinopt_filter_"
     if mesh.dim == 2:
         return direct_solver(matrix, prefix, own=True)
-    # On boxes 20 to 50 steps; with values in the facets 100 to 1200, 60 for every cell in r: at
-    # 100 700 facets 0.1 s for a radius of 3 cells, where MUMPS' factor takes 0.035 s, once 0.6 s.
+    # 60 steps for every cell in r: at 100 700 facets 0.1 s for a radius of 3 cells, where MUMPS'
+    # factor takes 0.035 s, once 0.6 s.
     return conjugate_gradients(matrix, prefix)
-
-
-def _solve(solver: PETSc.KSP, right: PETSc.Vec, solution: PETSc.Vec) -> None:
-    """Solve, or raise ConvergenceError; InputError with PETSc options of the user (collective)."""
-    with obeying_options(solver.getOptionsPrefix()):
-        solver.solve(right, solution)
-    if solver.getConvergedReason() < 0:
-        raise ConvergenceError(
-            "the filter's linear system is not solved: its conjugate gradients do not converge; "
-            "take a smaller design.filter_radius, or a mesh of less distorted cells"
-        )
-
-
-def _positive_definite(mat: PETSc.Mat) -> PETSc.Mat:
-    mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    mat.setOption(PETSc.Mat.Option.SPD, True)
-    return mat
 
 
 # -- designs that are symmetric about an arm's axis or planes, or the same over its thickness ----

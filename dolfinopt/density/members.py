@@ -131,14 +131,15 @@ def _width(inside: np.ndarray, most: int, hinges: bool) -> tuple[int, Place]:
     # From sample to sample: as far as the middle of a strip of so many samples in diameter.
     depth = 2.0 * ndimage.distance_transform_edt(inside)
     low, high = 0, min(int(depth.max()), most) + 1
-    place = _place(int(np.argmax(depth)), depth)
+    place, middle = _place(int(np.argmax(depth)), depth), 1
+    # From below: in space a ball much wider than a member takes it for an edge, see `THIN`.
     while high - low > 1:
-        middle = (low + high) // 2
         found = _thinner(inside, depth, middle)
         if found is None:
-            low = middle
+            low, middle = middle, min(max(middle + 1, int(middle / THIN)), (middle + high) // 2)
         else:
             high, place = middle, found
+            middle = (low + high) // 2
     return low, place
 
 

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from dolfinopt.fem.measured import KERNEL_CHUNK_ENTRIES, STRESS_CHUNK_CELLS, STRESS_CHUNK_ENTRIES
+from dolfinopt.fem.measured import STRESS_CHUNK_CELLS, STRESS_CHUNK_ENTRIES
 from dolfinopt.fem.tensors import ElementTensors
 from dolfinopt.profiling import Profile
 
@@ -228,12 +228,6 @@ def combine(field: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     return flat.reshape(*field.shape[:2], coefficients.shape[1])
 
 
-def runs_of_columns(field: np.ndarray) -> list[slice]:
-    """Return runs of the columns of a nodal field (n_nodes, d, k): not all are copied at once."""
-    step = max(1, KERNEL_CHUNK_ENTRIES * field.shape[2] // max(1, field.size))
-    return [slice(k, k + step) for k in range(0, field.shape[2], step)]
-
-
 # -- nodal fields on cells, and energies cell by cell: derivatives by the material of each cell ----
 #
 # Arrays by cells have the cells last, (..., n_cells), so that one matrix product serves all cells
@@ -337,12 +331,11 @@ class Cells:
 
     def stiffness_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Return sum_k left_k' k_e right_k (n_cells,) for nodal fields (n_nodes, d, k)."""
-        out = np.zeros(self.count)
-        for part in runs_of_columns(left):
-            rows, others = self.by_component(left[:, :, part]), self.by_component(right[:, :, part])
-            for cells in self._runs(len(rows)):
-                values, more = self.differences(rows, cells), self.differences(others, cells)
-                out[cells] += self.difference_products(values, more, cells)
+        rows, others = self.by_component(left), self.by_component(right)
+        out = np.empty(self.count)
+        for cells in self._runs(len(rows)):
+            values, more = self.differences(rows, cells), self.differences(others, cells)
+            out[cells] = self.difference_products(values, more, cells)
         return out
 
     def mass_products(self, left: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -8,14 +8,12 @@ ranks, needs no further communication; `restrict` adds the contributions of all 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from copy import copy
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from mpi4py import MPI
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from dolfinopt.fem.assembly import (
@@ -31,7 +29,6 @@ from dolfinopt.fem.interface import (
     ConstraintModes,
     InterfaceTransformation,
     StaticFields,
-    joins,
     static_fields,
     static_modes,
 )
@@ -42,15 +39,13 @@ from dolfinopt.fem.interior import (
     interior_layout,
 )
 from dolfinopt.fem.measured import ENERGY_TOLERANCE, STATICS_TOLERANCE
-from dolfinopt.fem.multigrid import box_of
+from dolfinopt.fem.multigrid import Columns, box_of
 from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.fem.stress import stress_operator
 from dolfinopt.fem.tensors import ElementTensors, element_centre
-from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.parallel import together, total
 
-Columns = Callable[[np.ndarray], np.ndarray]
 Rows = tuple[np.ndarray, np.ndarray]  # (num_interior, k) owned interior rows, (b, k) outboard rows
 
 
@@ -97,7 +92,6 @@ class Substructure:
         layout = interior_layout(mesh.name, self.T, self._pairs.pattern, tetrahedra, box)
         self.interior = LinearSystem(layout, profile, tolerance)
         self.extended = self._extended() if statics_alone and mesh.dim == 3 else None
-        self._last: ElasticArm | None = None
         self._interior_mass_of: AssembledMatrix | None = None
 
     def moved(self, mesh: ArmMesh, points: np.ndarray) -> Substructure:
@@ -120,7 +114,7 @@ class Substructure:
         other._stiffness = CellMatrix(self._pairs, other.cells.stiffness)
         other._mass = CellMatrix(self._pairs, other.cells.mass)
         other.T = self.T.moved(points)
-        other._last = other._interior_mass_of = None
+        other._interior_mass_of = None
         return other
 
     def _extended(self) -> LinearSystem:
@@ -146,16 +140,23 @@ class Substructure:
         return InteriorMatrix(layout.comm, entries, layout.rows)
 
     def joins(self, solid: np.ndarray) -> bool:
-        """Return whether the solid ones (n_cells,) of its cells join all interfaces."""
-        return joins(*self._graph, solid)
+        """Return whether solid ones (n_cells,) of its cells join all interfaces (collective).
 
-    @property
-    def _graph(self) -> tuple[MPI.Comm, Any, np.ndarray, list[np.ndarray]]:
-        operators, T = self.operators, self.T
-        nodes = operators.cells
-        if T.dim == 3:
-            nodes = nodes[:, : compat.cell_corner_count(self.mesh.mesh)]
-        return T.comm, operators.space, nodes, [T.inboard, *T.ends]
+        They do where cells that share nodes lead from one to the other.
+        """
+        T, numbering = self.T, self.operators.space.dofmap.index_map
+
+        def everywhere(nodes: np.ndarray) -> np.ndarray:
+            own = numbering.local_to_global(nodes.ravel().astype(np.int32))
+            return np.concatenate(T.comm.allgather(own))
+
+        nodes = self.operators.cells[solid]
+        first, second = map(everywhere, (np.broadcast_to(nodes[:, :1], nodes.shape), nodes))
+        graph = sp.coo_matrix((np.ones(first.size), (first, second)), 2 * (numbering.size_global,))
+        _, group = connected_components(graph, directed=False)
+        ends = [everywhere(np.flatnonzero(mask)) for mask in (T.inboard, *T.ends)]
+        at = [group[np.intersect1d(end, second)] for end in ends]
+        return all(np.intersect1d(at[0], other).size for other in at[1:])
 
     @cached_property
     def _rigid_forces(self) -> tuple[np.ndarray, np.ndarray]:
@@ -204,29 +205,14 @@ class Substructure:
         return ExtendedStiffness(K, np.append(coupling[self._near].ravel(), corner))
 
     def at(self, young: np.ndarray, density: np.ndarray) -> ElasticArm:
-        """Return the arm with these materials (collective); for the last ones, the same object.
-
-        Nothing is assembled before it is asked for.
+        """Return the arm with these materials; nothing is assembled before it is asked for.
 
         Args:
             young: (n_cells,) Young's modulus of the owned cells, Pa.
             density: (n_cells,) their mass density, kg/m3.
         """
-        last = self._last
-        same = self._same(last, young, density) if last else (False, False)
-        if last and all(same):
-            return last
-        K = last.K if last and same[0] else AssembledMatrix(self._stiffness, young, self.profile)
-        M = last.M if last and same[1] else AssembledMatrix(self._mass, density, self.profile)
-        self._last = ElasticArm(self, K, M)
-        return self._last
-
-    def _same(self, last: ElasticArm, young: np.ndarray, density: np.ndarray) -> tuple[bool, bool]:
-        """Return whether stiffness and mass are those of `last`, the same on all ranks."""
-        same = np.array([np.array_equal(young, last.young), np.array_equal(density, last.density)])
-        if self.mesh.comm.size > 1:  # some ranks may see no change in their cells
-            self.mesh.comm.Allreduce(MPI.IN_PLACE, same, op=MPI.LAND)
-        return bool(same[0]), bool(same[1])
+        K = AssembledMatrix(self._stiffness, young, self.profile)
+        return ElasticArm(self, K, AssembledMatrix(self._mass, density, self.profile))
 
 
 class ElasticArm:
@@ -360,7 +346,7 @@ class ElasticArm:
             outboard: (b, k) f_b, N, N m.
             inverse: in place of `solve`.
         """
-        modes = self.constraint_modes()
+        modes = self.constraint_modes
         lift = total(self.comm, modes.interior.T @ interior)
         tip = np.linalg.solve(modes.stiffness, outboard + lift)
         return (inverse or self.solve)(interior) + modes.interior @ tip, tip
@@ -387,21 +373,13 @@ class ElasticArm:
         return out[:size], self.comm.bcast(out[size:], root=self.comm.size - 1)
 
     @cached_property
-    def _constraint_modes(self) -> ConstraintModes:
-        return static_modes(self)
-
     def constraint_modes(self) -> ConstraintModes:
-        """Return the static fields of unit displacements of the outboard interface; solved once.
+        """The static fields of unit displacements of the outboard interface.
 
         Raises:
             ConvergenceError: the contrast between solid and void is too large for this design.
         """
-        return self._constraint_modes
-
-    @property
-    def has_constraint_modes(self) -> bool:
-        """Whether somebody has asked for them."""
-        return "_constraint_modes" in self.__dict__
+        return static_modes(self)
 
     def static_fields(self, loads: np.ndarray) -> StaticFields:
         """Return the static fields that such loads (b, k) of the outboard interfaces need.

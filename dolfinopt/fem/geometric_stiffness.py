@@ -216,7 +216,7 @@ def unit_loads(arm: ElasticArm) -> UnitLoads:
 
 def interface_fields(arm: ElasticArm) -> np.ndarray:
     """Return the static fields (n_nodes, d, b) of unit loads of the outboard interfaces."""
-    modes = arm.constraint_modes()
+    modes = arm.constraint_modes
     return combine(modes.field, np.linalg.inv(modes.stiffness))
 
 
@@ -292,8 +292,7 @@ class FaceRotation:
     def _reactions(self, fields: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Return K u_p - f_p of the cells beside the interfaces (cells, n, d, p)."""
         arm, nodes = self.arm, self._nodes
-        values = fields[nodes] - fields[nodes].mean(axis=1, keepdims=True)
-        forces = self._stiffness_times(values)
+        forces = self._stiffness_times(_strained(fields[nodes]))
         inertia = np.einsum("enm,emap->enap", self._mass, accelerations[nodes])
         inertia *= arm.density[self._near, None, None, None]
         forces[..., : accelerations.shape[2]] -= inertia
@@ -341,8 +340,7 @@ class FaceRotation:
     def stiffness_products(self, y: np.ndarray, fields: np.ndarray) -> np.ndarray:
         """Return sum_p y_p' k_e u_p (n_cells,) for y that is zero but at the interface."""
         out, nodes = np.zeros_like(self.arm.young), self._nodes
-        values = fields[nodes] - fields[nodes].mean(axis=1, keepdims=True)
-        forces = self._unit_stiffness_times(values)
+        forces = self._unit_stiffness_times(_strained(fields[nodes]))
         out[self._near] = np.einsum("enap,enap->e", y[nodes], forces)
         return out
 
@@ -354,6 +352,11 @@ class FaceRotation:
         count, n, dim, p = values.shape
         forces = self._stiffness @ values.reshape(count, dim * n, p)
         return forces.reshape(values.shape)
+
+
+def _strained(values: np.ndarray) -> np.ndarray:
+    """Return nodal values (cells, n, d, p) less their mean, which does not strain a cell."""
+    return values - values.mean(axis=1, keepdims=True)
 
 
 def _levers(rigid: np.ndarray) -> np.ndarray:

@@ -6,18 +6,17 @@ There are b = 3 outboard coordinates in the plane, in space 6 of every outboard 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
 from dolfinx import fem
 from mpi4py import MPI
-from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
@@ -70,7 +69,7 @@ class InterfaceTransformation:
             graph: (n_nodes, n_nodes) with an entry where two nodes share a cell.
 
         Raises:
-            InputError: the mesh lacks an interface.
+            InputError: the mesh lacks an interface, or two share a node.
         """
         self.comm = mesh.comm
         self._space = operators.space
@@ -80,7 +79,12 @@ class InterfaceTransformation:
         sides = {"inboard": mesh.inboard_facets, "outboard": mesh.outboard_facets}
         sides |= {one.name: one.facets for one in mesh.further}
         masks = {name: self._nodes_of(mesh, facets, name) for name, facets in sides.items()}
-        self._check_apart(mesh, masks)
+        for one, other in combinations(masks, 2):
+            if self.comm.allreduce(int((masks[one] & masks[other]).sum())):
+                raise InputError(
+                    f"arm {mesh.name!r}: interfaces {one!r} and {other!r} share nodes; "
+                    "each is rigid: leave a cell between them"
+                )
         self.inboard, *self.ends = masks.values()
         self.outboard = np.any(self.ends, axis=0)
         self.places = np.array([mesh.outboard_point, *mesh.further_points])
@@ -104,15 +108,6 @@ class InterfaceTransformation:
             for at, x in zip(self.ends, self.places, strict=True)
         ]
         return np.concatenate(parts, axis=2)
-
-    def _check_apart(self, mesh: ArmMesh, masks: Mapping[str, np.ndarray]) -> None:
-        """Raise InputError where two interfaces, rigid both, share a node."""
-        for one, other in combinations(masks, 2):
-            if self.comm.allreduce(int((masks[one] & masks[other]).sum())):
-                raise InputError(
-                    f"arm {mesh.name!r}: interfaces {one!r} and {other!r} share nodes; "
-                    "each is rigid: leave a cell between them"
-                )
 
     def _nodes_of(self, mesh: ArmMesh, facets: np.ndarray, side: str) -> np.ndarray:
         """Return (n_nodes,) True for the nodes of the interface `side`."""
@@ -250,20 +245,16 @@ def _narrow_order(graph: sp.csr_matrix, points: np.ndarray) -> tuple[np.ndarray,
     # as wide as the other one, which begins at a corner.
     nearest = GRID_ROUNDING_SHARE * np.ptp(points[:, 0])
     along, *across = (_places(each, nearest) for each in points.T)
-    orders = (
-        np.lexsort((*across, along)),
-        reverse_cuthill_mckee(graph, symmetric_mode=True),
-    )
     rows, columns = graph.nonzero()
+    number = np.empty(len(points), dtype=np.int64)
 
     def bandwidth(order: np.ndarray) -> int:
-        number = np.empty(len(order), dtype=np.int64)
         number[order] = np.arange(len(order))
         return int(np.abs(number[rows] - number[columns]).max(initial=0))
 
-    widths = [bandwidth(order) for order in orders]
-    best = int(np.argmin(widths))
-    return orders[best], widths[best]
+    orders = np.lexsort((*across, along)), reverse_cuthill_mckee(graph, symmetric_mode=True)
+    best = min(orders, key=bandwidth)
+    return best, bandwidth(best)
 
 
 def _places(values: np.ndarray, nearest: float) -> np.ndarray:
@@ -359,8 +350,8 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
     new = on_root(arm.comm, _new_directions, known.directions, loads, error or ENERGY_TOLERANCE)
     if new.shape[1] == 0:
         return known
-    if arm.has_constraint_modes or extended is None or is_soft(arm):
-        modes = arm.constraint_modes()
+    if "constraint_modes" in vars(arm) or extended is None or is_soft(arm):
+        modes = arm.constraint_modes
         return StaticFields(np.eye(b), modes.field, np.eye(b), modes.stiffness)
     interior, tip = arm.solve_loads(new)
     field = np.concatenate([known.field, arm.expand(interior, tip)], axis=2)
@@ -440,40 +431,7 @@ def _is_stiffness(matrix: np.ndarray) -> bool:
     return True
 
 
-# -- solid cells that only far softer ones connect to an arm's interfaces ------------------------
-
-
 def extremes(comm: MPI.Comm, values: np.ndarray) -> tuple[float, float]:
     """Return the least and the largest of positive values on all ranks."""
     low = comm.allreduce(values.min(initial=np.inf), op=MPI.MIN)
     return low, comm.allreduce(values.max(initial=0.0), op=MPI.MAX)
-
-
-def joins(
-    comm: MPI.Comm,
-    space: Any,
-    cells: np.ndarray,
-    interfaces: list[np.ndarray],
-    solid: np.ndarray,
-) -> bool:
-    """Return whether solid cells that share nodes lead from the first interface to all others.
-
-    Collective on `comm`, the same on all ranks.
-
-    Args:
-        comm, space, cells, interfaces: as of `Connectivity`.
-        solid: (n_cells,) True for the owned cells that count.
-    """
-    number = space.dofmap.index_map.local_to_global
-    nodes = number(cells[solid].ravel().astype(np.int32)).reshape(-1, cells.shape[1])
-    nodes = np.concatenate(comm.allgather(nodes))
-    ends = [
-        np.concatenate(comm.allgather(number(np.flatnonzero(mask).astype(np.int32))))
-        for mask in interfaces
-    ]
-    first, second = np.repeat(nodes[:, 0], nodes.shape[1]), nodes.ravel()
-    size = space.dofmap.index_map.size_global
-    graph = sp.coo_matrix((np.ones(first.size), (first, second)), shape=(size, size))
-    _, group = connected_components(graph, directed=False)
-    at = [group[np.intersect1d(end, second)] for end in ends]
-    return all(np.intersect1d(at[0], other).size for other in at[1:])

@@ -195,30 +195,17 @@ class BandSolver(Factor):
     name = "LAPACK's band"
 
     def __init__(self, layout: Layout):
-        self._layout, entries = layout, layout.entries()
+        entries, self.failed = layout.entries(), False
         self._band = BandCholesky(entries.rows, entries.columns, layout.rows)
         self._source = entries.source[self._band.taken]
-        self._is_definite = True
-
-    @cached_property
-    def _indefinite(self) -> PetscSolver:
-        """What rounding has made indefinite MUMPS factorises all the same."""
-        return PetscSolver(self._layout)
-
-    @property
-    def failed(self) -> bool:
-        """See `Factor`."""
-        return not self._is_definite and self._indefinite.failed
 
     def update(self, K: Stiffness) -> None:
         """Take another design."""
-        self._is_definite = self._band.factorise(K.data.take(self._source, mode="clip"))
-        if not self._is_definite:
-            self._indefinite.update(K)
+        self.failed = not self._band.factorise(K.data.take(self._source, mode="clip"))
 
     def precondition(self, right: np.ndarray) -> np.ndarray:
         """See `Factor`."""
-        return (self._band if self._is_definite else self._indefinite).solve(right)
+        return self._band.solve(right)
 
 
 Solver = PetscSolver | BandSolver | MultigridSolver

@@ -41,7 +41,6 @@ AXES = (0, 2, 1)  # directions in the order of nodes: along, thickness, height; 
 CORNERS = tuple(product((0, 1), repeat=3))  # of a cell, in these directions
 
 Columns = Callable[[np.ndarray], np.ndarray]
-NAME = "conjugate gradients"  # of the solver
 
 
 @dataclass(frozen=True, eq=False)
@@ -486,7 +485,7 @@ class MultigridSolver:
         steps: of conjugate gradients, of the last solution.
     """
 
-    name = NAME
+    name = "conjugate gradients"
 
     def __init__(self, box: Box, coordinates: bool, tolerance: float):
         """Set up for a box, see `BoxMultigrid`."""

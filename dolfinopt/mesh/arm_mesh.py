@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.checks import cell_sizes, edge_lengths, facet_areas, facet_corners
+from dolfinopt.mesh.checks import cell_sizes, edge_lengths, facet_corners
 from dolfinopt.mesh.geometry import build_model
 from dolfinopt.mesh.gmsh_session import (
     FURTHER,
@@ -247,8 +247,7 @@ def _all_cells(mesh: ArmMesh) -> Cells:
     from dolfinopt.scene.regions import Cells
 
     numbering = mesh.mesh.topology.index_map(mesh.mesh.topology.dim)
-    first, second, _, _ = interior_facets(mesh.mesh)
-    pairs = numbering.local_to_global(np.stack([first, second], axis=1).ravel().astype(np.int32))
+    pairs = numbering.local_to_global(neighbours(mesh.mesh).ravel().astype(np.int32))
     facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
     mine = (
         mesh.centroid,
@@ -277,28 +276,14 @@ def _distance(points: np.ndarray, facets: np.ndarray) -> np.ndarray:
     return nearest
 
 
-def interior_facets(mesh: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the facets between two cells this rank knows, ghost cells included.
-
-    Returns:
-        Local numbers of the two cells, the facet's length (area in space) and the distance of the
-        cells' centroids, each (n_facets,); m, m2.
-    """
+def neighbours(mesh: Any) -> np.ndarray:
+    """Return the local numbers (n, 2) of cells with a common facet, ghost cells included."""
     owned, ghosts = compat.local_cell_counts(mesh)
-    nodes = compat.cell_geometry_nodes(mesh, owned + ghosts)
-    dim = mesh.geometry.dim
-    corners = mesh.geometry.x[nodes][:, :, :dim]
-    sides = facet_corners(dim, nodes.shape[1])
-    ends = np.concatenate([np.sort(nodes[:, side], axis=1) for side in sides])
-    cell = np.tile(np.arange(len(nodes)), len(sides))
-    order = np.lexsort(ends.T[::-1])
-    twice = np.flatnonzero((ends[order[1:]] == ends[order[:-1]]).all(axis=1))
-    first, second = cell[order[twice]], cell[order[twice + 1]]
-    centroid = corners.mean(axis=1)
-    distance = np.linalg.norm(centroid[first] - centroid[second], axis=1)
-    around = np.concatenate([nodes[:, side] for side in sides])[order[twice]]
-    area = np.linalg.norm(facet_areas(mesh.geometry.x[around][:, :, :dim]), axis=1)
-    return first, second, area, distance
+    facets = compat.cell_facets(mesh, owned + ghosts)
+    order = np.argsort(facets.ravel(), kind="stable")
+    sorted_facets, cell = facets.ravel()[order], order // facets.shape[1]
+    twice = np.flatnonzero(sorted_facets[1:] == sorted_facets[:-1])
+    return np.stack([cell[twice], cell[twice + 1]], axis=1)
 
 
 # -- solid arms that are boxes: grids of hexahedra -----------------------------------------------
@@ -433,6 +418,6 @@ def _hull(gmsh: Any, arm: scenes.Arm) -> Hull:
         return read_hull(gmsh, arm)
     assert arm.cells is not None and len(arm.cells) == 3
     size = arm.length, arm.height, arm.thickness
-    if arm.section == "tube":
+    if arm.hollow == "tube":
         return tube_hull(size, arm.cells)
     return box_hull(size, arm.cells, arm.wall_limits[1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from itertools import combinations
 from pathlib import Path
 
 import basix
@@ -123,7 +122,14 @@ def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
         bad = _covered(corners)
     kind, shared = ("surfaces", "curves") if dim == 2 else ("volumes", "faces")
     _refuse(bad, corners, f"overlap others (inverted cells, or {kind} on top of each other)")
-    _check_parts(cells, f"{kind} must share their {shared}")
+    starts = cells.shape[1] * np.arange(len(cells) + 1)
+    incidence = sp.csr_matrix((np.ones(cells.size), cells.ravel(), starts))
+    pieces = connected_components(incidence @ incidence.T, directed=False)[0]
+    if pieces > 1:
+        raise InputError(
+            f"it consists of {pieces} separate parts; neighbouring {kind} must share their "
+            f"{shared} and nodes"
+        )
 
 
 def check_facets(facets: np.ndarray, cells: np.ndarray, dim: int, name: str) -> None:
@@ -220,15 +226,6 @@ def _overlapping(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
     return bad
 
 
-def _check_parts(cells: np.ndarray, what: str) -> None:
-    count, width = cells.shape
-    start = np.arange(0, count * width + 1, width)
-    incidence = sp.csr_matrix((np.ones(cells.size), cells.ravel(), start))
-    pieces = connected_components(incidence @ incidence.T, directed=False)[0]
-    if pieces > 1:
-        raise InputError(f"it consists of {pieces} separate parts; neighbouring {what} and nodes")
-
-
 # -- cells with straight edges: which corners their facets have, areas and volumes ---------------
 
 KINDS = {
@@ -248,6 +245,11 @@ def facet_corners(dim: int, corners: int) -> list[list[int]]:
     return facets
 
 
+def edge_corners(dim: int, corners: int) -> np.ndarray:
+    """Return the corners (e, 2) of every edge of a cell of dimension `dim`."""
+    return np.array(basix.topology(KINDS[dim, corners])[1])
+
+
 def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
     """Return the lengths (m,) of all edges of cells of dimension `dim`, in DOLFINx's corner order.
 
@@ -255,11 +257,7 @@ def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
         dim: 2 or 3.
         corners: (n, corners, d) m.
     """
-    count = corners.shape[1]
-    pairs = list(combinations(range(count), 2))
-    if count != dim + 1:  # corners of a tensor product differ in one bit along an edge
-        pairs = [(i, j) for i, j in pairs if (i ^ j).bit_count() == 1]
-    first, second = np.array(pairs).T
+    first, second = edge_corners(dim, corners.shape[1]).T
     return np.linalg.norm(corners[:, first] - corners[:, second], axis=2).ravel()
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dolfinopt.errors import InputError
+from dolfinopt.mesh.gmsh_session import telling
 from dolfinopt.mesh.measured import LINE_CHARACTERS_LIMIT, WORD_CHARACTERS_LIMIT
 
 # What each kind of file begins with; Gmsh takes a file that does not for a text in its language.
@@ -126,12 +127,8 @@ def open_file(gmsh: Any, path: str | Path) -> None:
         else:
             check_start(path)
             seen.symlink_to(path.absolute())
-        try:
+        with telling(lambda text: Exception(text.replace(str(seen), path.name))):
             gmsh.open(str(seen))
-        except Exception as error:
-            if type(error) is not Exception:  # Gmsh raises no other
-                raise
-            raise Exception(str(error).replace(str(seen), path.name)) from None
 
 
 def check_start(path: Path) -> None:

@@ -29,6 +29,7 @@ from dolfinopt.mesh.gmsh_session import (
     mesh_surfaces,
     mesh_volumes,
     silent_terminal,
+    telling,
 )
 from dolfinopt.mesh.inp import read_inp
 from dolfinopt.mesh.measured import FILE_ROUNDING_SHARE
@@ -67,14 +68,10 @@ def where_of(arm: Arm) -> str:
 def telling_where(where: str) -> Iterator[None]:
     """Put file and arm before what is wrong with them, and before what Gmsh says."""
     try:
-        yield
+        with telling(lambda text: InputError(f"{text}; open the file in Gmsh to repair it")):
+            yield
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    except Exception as error:
-        if type(error) is not Exception:  # Gmsh raises no other
-            raise
-        text = " ".join(str(error).split()) or "Gmsh failed"
-        raise InputError(f"{where}: {text}; open the file in Gmsh to repair it") from None
 
 
 def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -90,9 +87,11 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
     """
     unknown: list[str] = []
     where = where_of(arm)
+    readers = {".step": read_step, ".stp": read_step, ".inp": read_inp}
+    reader = readers.get(Path(str(arm.mesh)).suffix.lower(), read_groups)
     with telling_where(where):
         with silent_terminal():
-            groups = _read(gmsh, arm, unknown)
+            groups = reader(gmsh, arm, unknown)
             check_unit(arm.mesh_scale * gmsh.model.mesh.getNodes()[1].reshape(-1, 3), arm)
             groups = placed(gmsh, groups, arm)
         _set_groups(gmsh, groups, arm)
@@ -102,11 +101,6 @@ def build_model(gmsh: Any, arm: Arm) -> tuple[np.ndarray, tuple[str, ...]]:
     if SOLID in _parameters(gmsh):
         facets = facets[:0]
     return facets, (_unknown_names(where, unknown),) if unknown else ()
-
-
-def _read(gmsh: Any, arm: Arm, unknown: list[str]) -> Entities:
-    readers = {".step": read_step, ".stp": read_step, ".inp": read_inp}
-    return readers.get(Path(str(arm.mesh)).suffix.lower(), read_groups)(gmsh, arm, unknown)
 
 
 def read_groups(gmsh: Any, arm: Arm, unknown: list[str]) -> Entities:
@@ -266,24 +260,17 @@ def _check(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
     dim = 3 if arm.is_solid else 2
     points, regions = points_by_tag(gmsh), [one for tag in REGIONS for one in groups[tag]]
     cells = elements_of(gmsh, dim, regions)
-    cells = cells[:, TENSOR[dim, cells.shape[1]]]
+    cells = cells[:, TENSOR[cells.shape[1], dim]]
     facets = {
         name: elements_of(gmsh, dim - 1, groups[tag]) for tag, name in interface_names(arm).items()
     }
     if dim == 2:
-        _check_flat(points[np.unique(cells)], facets["inboard"], arm)
+        off = np.abs(points[np.unique(cells), 2]).max()
+        if off > FILE_ROUNDING_SHARE * arm.height:
+            raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")
     check_mesh(points[:, :dim], cells, facets, arm)
     corners = [points[one][:, :, :dim] for one in facets.values()]
     if dim == 2:
         return np.concatenate(corners)
     parts = [part for one in corners for part in (one.reshape(-1, 3), one.mean(axis=1))]
     return np.concatenate(parts)[:, None]
-
-
-def _check_flat(used: np.ndarray, lines: np.ndarray, arm: Arm) -> None:
-    """Raise InputError unless lines are straight, and points (n, 3) in the plane z = 0."""
-    if lines.shape[1] != 2:
-        raise InputError("its lines are curved; expected straight ones (Mesh.ElementOrder = 1)")
-    off = np.abs(used[:, 2]).max()
-    if off > FILE_ROUNDING_SHARE * arm.height:
-        raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")

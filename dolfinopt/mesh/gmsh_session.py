@@ -64,6 +64,17 @@ def _interrupts_kept() -> Iterator[None]:
         signal.signal = change
 
 
+@contextmanager
+def telling(told: Callable[[str], Exception]) -> Iterator[None]:
+    """Put what Gmsh says about its own errors into those that `told` makes of it."""
+    try:
+        yield
+    except Exception as error:
+        if type(error) is not Exception:  # Gmsh raises no other
+            raise
+        raise told(" ".join(str(error).split()) or "Gmsh failed") from None
+
+
 def _begin(gmsh: Any) -> None:
     gmsh.initialize(readConfigFiles=False)  # same cells for every user
     gmsh.option.setNumber("General.Terminal", 0)

@@ -526,9 +526,9 @@ def _radii(triangles: np.ndarray, x: float, rays: np.ndarray, arm: Arm) -> np.nd
         if apart.sum() != 1:
             raise InputError(
                 f"{arm.hull}: arm {arm.name!r}: seen from the axis at x = {x:.4g} m in the "
-                f"direction y, z = {ray[0]:.3g}, {ray[1]:.3g} the surface lies {apart.sum()} times "
-                "one behind the other, expected once: hollow arms have sections that are "
-                'star-shaped about the axis; close holes, or take section = "box" or "tube"'
+                f"direction y, z = {ray[0]:.3g}, {ray[1]:.3g} a ray meets the surface "
+                f"{apart.sum()} times, expected once: hollow arms have sections that are "
+                'star-shaped about the axis; close holes, or take hollow = "box" or "tube"'
             )
         found[k] = radius[-1]
     return found

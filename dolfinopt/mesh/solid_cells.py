@@ -18,6 +18,7 @@ from mpi4py import MPI
 
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
+from dolfinopt.mesh.checks import edge_lengths
 from dolfinopt.mesh.gmsh_session import (
     DESIGN,
     FURTHER,
@@ -32,6 +33,7 @@ from dolfinopt.mesh.gmsh_session import (
     gmsh_on_root,
     in_child,
     silent_terminal,
+    telling,
 )
 from dolfinopt.mesh.measured import (
     BORE_RADIUS_SHARE,
@@ -49,12 +51,13 @@ STRAIGHT = {  # by dimension and number of corners
     (3, 4): TETRAHEDRON,
     (3, 8): HEXAHEDRON,
 }
-# From Gmsh's order of corners to that of a tensor product, DOLFINx's.
-TENSOR = {
-    (2, 3): [0, 1, 2],
-    (2, 4): [0, 1, 3, 2],
-    (3, 4): [0, 1, 2, 3],
-    (3, 8): [0, 1, 3, 2, 4, 5, 7, 6],
+# From Gmsh's and VTK's order of corners, around the cell, to that of a tensor product, DOLFINx's,
+# and back; by the number of corners and the dimension.
+TENSOR: dict[tuple[int, ...], list[int]] = {
+    (3, 2): [0, 1, 2],
+    (4, 2): [0, 1, 3, 2],
+    (4, 3): [0, 1, 2, 3],
+    (8, 3): [0, 1, 3, 2, 4, 5, 7, 6],
 }
 # Sides of cells in Gmsh's order of corners, around them, by the number of corners.
 SIDES = {
@@ -66,13 +69,6 @@ ENDS = (INBOARD, OUTBOARD)
 Entities = dict[int, list[int]]  # of every group
 
 
-def further_of(arm: Arm) -> dict[str, int]:
-    """Return the groups of the arm's further interfaces by their names, small letters."""
-    return {
-        one.name.strip().casefold(): FURTHER + k for k, one in enumerate(arm.further_interfaces)
-    }
-
-
 def group_named(name: str, *groups: int) -> int | None:
     """Return which of `groups` a name in a file means: "Passive2" begins with passive."""
     known = name.strip().casefold()
@@ -81,12 +77,13 @@ def group_named(name: str, *groups: int) -> int | None:
 
 def interface_named(name: str, arm: Arm) -> int | None:
     """Return the group of the arm's interface that a name in a file means."""
-    return further_of(arm).get(name.strip().casefold()) or group_named(name, *ENDS)
+    groups = {known.casefold(): tag for tag, known in interface_names(arm).items()}
+    return groups.get(name.strip().casefold()) or group_named(name, *ENDS)
 
 
 def no_groups(arm: Arm) -> Entities:
     """Return all groups of an arm without entities."""
-    return {tag: [] for tag in (*NAMES, *further_of(arm).values())}
+    return {tag: [] for tag in (*NAMES, *interface_names(arm))}
 
 
 def interface_names(arm: Arm) -> dict[int, str]:
@@ -259,11 +256,9 @@ class Tetrahedra:
 
         Source: Liu & Joe (1994), doi:10.1007/BF01955874.
         """
-        corners = self.points[self.cells]
-        pairs = np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
-        edges = corners[:, pairs[:, 0]] - corners[:, pairs[:, 1]]
+        edges = edge_lengths(3, self.points[self.cells]).reshape(-1, 6)
         volume = np.maximum(self.volumes, 0.0)
-        return np.asarray(12.0 * (3.0 * volume) ** (2.0 / 3.0) / np.square(edges).sum(axis=(1, 2)))
+        return np.asarray(12.0 * (3.0 * volume) ** (2.0 / 3.0) / np.square(edges).sum(axis=1))
 
     @property
     def boundary(self) -> np.ndarray:
@@ -326,13 +321,9 @@ def _filled_anew(gmsh: Any, mesh: Tetrahedra, size: float) -> Tetrahedra:
     rim = np.unique(facets)
     number = np.full(len(mesh.points), -1)
     number[rim] = np.arange(len(rim))
-    model = gmsh.model
-    model.add("surface")
-    model.addDiscreteEntity(2, 1)
-    model.mesh.addNodes(2, 1, np.arange(1, len(rim) + 1), mesh.points[rim].ravel())
-    model.mesh.addElementsByType(1, TRIANGLE, [], number[facets].ravel() + 1)
+    _add_surface(gmsh, mesh.points[rim], number[facets])
     solid = _generated(gmsh, [1], size)
-    found = _cells(model, solid, {group: [] for group in ENDS})
+    found = _cells(gmsh, solid, {group: [] for group in ENDS})
     if found.volumes.min() <= 0.0 or not np.array_equal(found.points[: len(rim)], mesh.points[rim]):
         raise InputError("its cells do not fill it")
     return replace(
@@ -345,17 +336,21 @@ def _filled_anew(gmsh: Any, mesh: Tetrahedra, size: float) -> Tetrahedra:
 
 def _with_gmsh(work: Callable[..., Tetrahedra], *given: Any) -> Tetrahedra:
     """Return what `work` makes with Gmsh, on this process alone; its errors are InputErrors."""
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        try:
-            with silent_terminal():
-                return work(gmsh, *given)
-        except InputError:
-            raise
-        except Exception as error:
-            if type(error) is not Exception:  # Gmsh raises no other
-                raise
-            text = " ".join(str(error).split()) or "Gmsh failed"
-            raise InputError(f"its surface cannot be meshed ({text})") from None
+
+    def told(text: str) -> InputError:
+        return InputError(f"its surface cannot be meshed ({text})")
+
+    with gmsh_on_root(MPI.COMM_SELF) as gmsh, telling(told), silent_terminal():
+        return work(gmsh, *given)
+
+
+def _add_surface(gmsh: Any, points: np.ndarray, triangles: np.ndarray) -> None:
+    """Make triangles (m, 3) of points (n, 3) surface 1 of a new model."""
+    mesh = gmsh.model.mesh
+    gmsh.model.add("surface")
+    gmsh.model.addDiscreteEntity(2, 1)
+    mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
+    mesh.addElementsByType(1, TRIANGLE, [], triangles.ravel() + 1)
 
 
 def _generated(gmsh: Any, faces: list[int], size: float) -> int:
@@ -378,11 +373,8 @@ def _meshed(
     interfaces: tuple[np.ndarray, np.ndarray],
     edge: float,
 ) -> Tetrahedra:
+    _add_surface(gmsh, points, triangles)
     model = gmsh.model
-    model.add("surface")
-    model.addDiscreteEntity(2, 1)
-    model.mesh.addNodes(2, 1, np.arange(1, len(points) + 1), points.ravel())
-    model.mesh.addElementsByType(1, TRIANGLE, [], triangles.ravel() + 1)
     model.mesh.classifySurfaces(edge, True, True, math.pi)
     model.mesh.createGeometry()
     faces = [tag for _, tag in model.getEntities(2)]
@@ -393,7 +385,7 @@ def _meshed(
     for group, own in chosen.items():
         if not own:
             raise InputError(f"the {NAMES[group]} interface is lost in its faces")
-    found = _cells(model, solid, chosen)
+    found = _cells(gmsh, solid, chosen)
     volumes = found.volumes
     a, b, c = points[triangles].swapaxes(0, 1)  # each with the origin a tetrahedron
     expected = np.einsum("na,na->", a, np.cross(b, c)) / 6.0
@@ -418,18 +410,15 @@ def _faces_of(
     return found
 
 
-def _cells(model: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahedra:
+def _cells(gmsh: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahedra:
     """Return the cells of a meshed solid with the facets of its interfaces' faces."""
-    tags, places, _ = model.mesh.getNodes()
-    nodes = model.mesh.getElementsByType(TETRAHEDRON, solid)[1].reshape(-1, 4).astype(int)
+    points, nodes_of = points_by_tag(gmsh), gmsh.model.mesh.getElementsByType
+    nodes = nodes_of(TETRAHEDRON, solid)[1].reshape(-1, 4).astype(int)
     if not len(nodes):
         raise InputError("its volume has no cells")
     used, cells = np.unique(nodes, return_inverse=True)
-    number = np.full(int(tags.max()) + 1, -1)
+    number = np.full(len(points), -1)
     number[used] = np.arange(len(used))
-    points = np.empty((len(number), 3))
-    points[tags.astype(int)] = places.reshape(-1, 3)
-    nodes_of = model.mesh.getElementsByType
     facets = [
         number[np.concatenate([[], *(nodes_of(TRIANGLE, face)[1] for face in own)]).astype(int)]
         for own in (interfaces[group] for group in ENDS)

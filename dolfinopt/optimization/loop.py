@@ -220,7 +220,7 @@ class _Run:
             return False
         with together(self.world):
             for k, arm in self.arms.items():
-                arm.set_design(self.iterate.nominal.x_phys[k])
+                arm.state(self.iterate.nominal.x_phys[k])
         group = [self.scene, *pose_scenarios(self.scene)]
         if not reconsider_stiffening(group, self.partition, self.arms):
             return False

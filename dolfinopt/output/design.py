@@ -20,12 +20,12 @@ from dolfinopt.disk import (
 )
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
+from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.scene.law_variables import LAW, law_names, law_values, with_law
 from dolfinopt.scene.load import Arm as ArmKeys
-from dolfinopt.scene.load import Arm as SceneArm
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
@@ -38,15 +38,6 @@ if TYPE_CHECKING:
 
 
 CIRCLE = 48  # corners that stand for a circle in pictures
-
-
-# DOLFINx numbers corners of quadrilaterals and hexahedra as a tensor product; here they go around.
-AROUND: dict[tuple[int, ...], list[int]] = {
-    (3, 2): [0, 1, 2],
-    (4, 2): [0, 1, 3, 2],
-    (4, 3): [0, 1, 2, 3],
-    (8, 3): [0, 1, 3, 2, 4, 5, 7, 6],
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +142,7 @@ def _views(
             views.append(FIXED_VIEWS[scene.dimension](scene.arms[index], fixed_body(scene, index)))
             continue
         order = canonical_order(centroids[owner])
-        around = AROUND[corners[owner].shape[1:]]
+        around = TENSOR[corners[owner].shape[1:]]
         known = stress.get(index)
         views.append(
             ArmView(
@@ -191,7 +182,7 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
     return tuple(found)
 
 
-def _box_view(arm: SceneArm, body: ShapeIntegrals) -> ArmView:
+def _box_view(arm: ArmKeys, body: ShapeIntegrals) -> ArmView:
     """Return a rigid box from inboard to outboard."""
     side = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])  # of y and z
     faces = [
@@ -203,7 +194,7 @@ def _box_view(arm: SceneArm, body: ShapeIntegrals) -> ArmView:
     return ArmView(arm.name, corners, corners.mean(axis=1), np.ones(1), modes, False, arm.length)
 
 
-def _bar_view(arm: SceneArm, body: ShapeIntegrals) -> ArmView:
+def _bar_view(arm: ArmKeys, body: ShapeIntegrals) -> ArmView:
     """Return a body whose shape is not known as a bar from joint to joint."""
     # Between them it bends like a beam without loads: cubic polynomials that fit the outboard
     # interface's displacement and rotation.

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.disk import write_text
+from dolfinopt.disk import write_table
 from dolfinopt.dynamics.feed_forward import FeedForward, internal_rates
 from dolfinopt.scene.csv_table import BESIDE_JOINTS
 from dolfinopt.scene.load import Scene
@@ -33,10 +33,7 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
     header = ["t", *scene.driven, *(f"{rate}{name}" for name in scene.driven)]
     columns.append(seen.joint_forces[:, joints])
     header += [f"{drive}{name}" for name in scene.driven]
-    table = np.column_stack(columns)
-    line = ",".join(["%.15g"] * len(header)) + "\n"
-    text = line * len(table) % tuple(table.ravel().tolist())
-    write_text(folder / FILE, ",".join(header) + "\n" + text)
+    write_table(folder / FILE, header, columns, 15)
 
 
 def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.disk import read_arrays, write_arrays, write_text
+from dolfinopt.disk import read_arrays, write_arrays, write_table
 from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import joint_parts
@@ -61,11 +61,8 @@ def write_trajectory(
     }
     arrays["units"] = np.array([f"{name}: {units[name]}" for name in arrays])
     write_arrays(folder / "trajectory.npz", arrays)
-    table = np.column_stack(_columns(trajectory))
     header = list(trajectory_units(trajectory))
-    line = ",".join(["%.10g"] * len(header)) + "\n"
-    text = line * len(table) % tuple(table.ravel().tolist())
-    write_text(folder / "trajectory.csv", ",".join(header) + "\n" + text)
+    write_table(folder / "trajectory.csv", header, _columns(trajectory), 10)
 
 
 def _of_machine(trajectory: Trajectory) -> dict[str, np.ndarray]:

@@ -43,7 +43,7 @@ class WallMesh(Member):
 
     def figures(self) -> dict[str, Any]:
         """Return its entry of part.json."""
-        volume = cell_sizes(self.points[self.cells[:, TENSOR[3, 8]]]).sum()
+        volume = cell_sizes(self.points[self.cells[:, TENSOR[8, 3]]]).sum()
         return {self.kind: len(self.cells), "volume": float(volume)}
 
     def write(self, path: Path) -> None:

@@ -14,7 +14,8 @@ import numpy as np
 import pyvista
 
 from dolfinopt.mesh.checks import cell_sizes
-from dolfinopt.output.design import AROUND, ArmView
+from dolfinopt.mesh.solid_cells import TENSOR
+from dolfinopt.output.design import ArmView
 from dolfinopt.part.solid.surface import Surface, surface_at
 from dolfinopt.plots.design import (
     MEGA,
@@ -173,7 +174,7 @@ def material(view: ArmView, *, modes: bool = False) -> Surface:
         view: of a solid.
         modes: whether the reduced basis (n, 3, q) at the surface's points is wanted, as a field.
     """
-    order = AROUND[view.corners.shape[1:]]  # there and back
+    order = TENSOR[view.corners.shape[1:]]  # there and back
     fields = {"modes": view.modes[:, order]} if modes else {}
     return surface_at(view.corners[:, order], view.solid, LEVEL, fields)
 
@@ -305,7 +306,7 @@ def solid_parts_figure(
 
 def caption(view: ArmView, mass: float | None) -> str:
     """Return what stands above a link: its size, volume and mass."""
-    volumes = cell_sizes(view.corners[:, AROUND[view.corners.shape[1:]]])
+    volumes = cell_sizes(view.corners[:, TENSOR[view.corners.shape[1:]]])
     volume = float(volumes @ view.solid)
     filled = f" ({100.0 * volume / volumes.sum():.3g} %)"
     if view.wall is not None:

@@ -83,6 +83,29 @@ def orient(arm: ElasticArm, V: np.ndarray, MV: np.ndarray) -> np.ndarray:
     return np.where(mean < 0.0, -1.0, 1.0)
 
 
+def basis_of(
+    arm: ElasticArm, rows: Rows, start: np.ndarray, held: np.ndarray | None = None
+) -> Basis:
+    """Return the basis of K-orthogonal modes, which point the same way on any mesh.
+
+    Args:
+        arm: with its design set.
+        rows: of the modes, the constraint modes first where they are among them.
+        start: eigenvectors among the last of them, see `Basis`.
+        held: (b, b) stiffness of the constraint modes, whose signs stay.
+    """
+    arm.profile.counts.reductions += 1
+    V = arm.expand(*rows)
+    MV = arm.mass_times(V)
+    b = 0 if held is None else len(held)
+    energies = np.diag(arm.energy_matrix(V[:, :, b:]))
+    sign, stiffness = orient(arm, V, MV), np.diag(np.append(np.zeros(b), energies))
+    if held is not None:
+        sign[:b], stiffness[:b, :b] = 1.0, held
+    own = sign[len(sign) - start.shape[1] :]
+    return Basis(V * sign, MV * sign, stiffness, rows[1] * sign, start * own)
+
+
 # -- the inputs of the clamped-free arm, its outboard interface rigid --------------------------
 
 
@@ -283,13 +306,8 @@ def ritz(arm: ElasticArm, V: np.ndarray) -> Basis:
     # Stiffnesses differ by up to ten powers of ten, and y are as far from orthonormal as that.
     none = np.empty((*V.shape[:2], 0))
     V = orthonormalise(arm, combine(V, y), none, none).Q
-    outboard = arm.coordinates(V)
-    V = arm.expand(interior_rows(arm, V), outboard)
-    MV = arm.mass_times(V)
-    sign = orient(arm, V, MV)
-    stiffness = np.diag(np.diag(arm.energy_matrix(V)))
-    start = np.empty((arm.num_interior, 0))
-    return Basis(V * sign, MV * sign, stiffness, outboard * sign, start)
+    rows = interior_rows(arm, V), arm.coordinates(V)
+    return basis_of(arm, rows, np.empty((arm.num_interior, 0)))
 
 
 def interior_rows(arm: ElasticArm, field: np.ndarray) -> np.ndarray:

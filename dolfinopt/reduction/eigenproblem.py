@@ -11,8 +11,9 @@ from petsc4py import PETSc
 from slepc4py import SLEPc
 
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.elasticity import Columns, ElasticArm, Rows
+from dolfinopt.fem.elasticity import ElasticArm, Rows
 from dolfinopt.fem.measured import ENERGY_TOLERANCE, ROUNDING_SHARE, SOLVER_ITERATIONS
+from dolfinopt.fem.multigrid import Columns
 from dolfinopt.parallel import total
 from dolfinopt.reduction.measured import EIGENVALUE_GAP, LOST_MODE_SHARE, RAMP_SHARE, WARM_STEPS
 from dolfinopt.solver import obeying_options, user_options

@@ -18,12 +18,12 @@ from dolfinopt.reduction.basis import (
     Expansion,
     InverseSpace,
     Options,
+    basis_of,
     dot,
     frame_fields,
     frame_loads,
     interface_loads,
     interior_rows,
-    orient,
     orthonormalise,
     ritz,
     solve_at,
@@ -50,32 +50,21 @@ def craig_bampton(arm: ElasticArm, options: Options, start: np.ndarray | None = 
         options: coordinates q >= b; with q = b no eigenproblem is solved.
         start: `Basis.start` of a nearby design, or None.
     """
-    arm.profile.counts.reductions += 1
-    static = arm.constraint_modes()
+    static = arm.constraint_modes
     b = len(static.stiffness)
     normal = options.coordinates - b
     modes = np.empty((arm.num_interior, 0))
     if normal > 0:
         _, modes = lowest_eigenpairs(Pencil(arm), normal, start)
     outboard = np.hstack([np.eye(b), np.zeros((b, normal))])
-    V = arm.expand(np.hstack([static.interior, modes]), outboard)
-    MV = arm.mass_times(V)
-    sign = np.ones(options.coordinates)
-    sign[b:] = orient(arm, V[:, :, b:], MV[:, :, b:])
-    # Constraint and normal modes are K-orthogonal, normal modes among themselves, too.
-    stiffness = np.zeros((options.coordinates, options.coordinates))
-    stiffness[:b, :b] = static.stiffness
-    if normal > 0:
-        stiffness[b:, b:] = np.diag(np.diag(arm.energy_matrix(V[:, :, b:])))
-    return Basis(V * sign, MV * sign, stiffness, outboard, modes * sign[b:])
+    return basis_of(arm, (np.hstack([static.interior, modes]), outboard), modes, static.stiffness)
 
 
 def craig_bampton_adjoint(
     arm: ElasticArm,
     basis: Basis,
     options: Options,
-    interior: np.ndarray,
-    outboard: np.ndarray,
+    cotangents: Rows,
 ) -> AdjointFields:
     """Return mu and lambda mu with d(cotangents . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
 
@@ -84,10 +73,9 @@ def craig_bampton_adjoint(
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (b, q) cotangents of its outboard rows; without effect here.
+        cotangents: (.., q) of the rows of V; those of the outboard ones have no effect here.
     """
-    b = len(basis.outboard)
+    (interior, outboard), b = cotangents, len(basis.outboard)
     mu = arm.solve(interior[:, :b])
     values = np.concatenate([np.zeros(b), np.diag(basis.stiffness)[b:]])
     if interior.shape[1] > b:
@@ -108,33 +96,25 @@ def modal(arm: ElasticArm, options: Options, start: np.ndarray | None = None) ->
         options: coordinates q >= 1.
         start: `Basis.start` of a nearby design, or None.
     """
-    arm.profile.counts.reductions += 1
     pencil = Pencil(arm, is_free=True)
     _, vectors = lowest_eigenpairs(pencil, options.coordinates, start)
-    interior, outboard = pencil.split(vectors)
-    V = arm.expand(interior, outboard)
-    MV = arm.mass_times(V)
-    sign = orient(arm, V, MV)
-    stiffness = np.diag(np.diag(arm.energy_matrix(V)))
-    return Basis(V * sign, MV * sign, stiffness, outboard * sign, vectors * sign)
+    return basis_of(arm, pencil.split(vectors), vectors)
 
 
 def modal_adjoint(
     arm: ElasticArm,
     basis: Basis,
     options: Options,
-    interior: np.ndarray,
-    outboard: np.ndarray,
+    cotangents: Rows,
 ) -> AdjointFields:
     """Return mu and lambda mu with d(cotangents . V) = -sum_k mu_k . (dK - lambda_k dM) V_k.
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (b, q) cotangents of its outboard rows.
+        cotangents: (.., q) of the rows of V.
     """
     pencil, values = Pencil(arm, is_free=True), np.diag(basis.stiffness)
-    right = pencil.joined(interior, outboard)
+    right = pencil.joined(*cotangents)
     field = pencil.field(complement_solve(pencil, basis.start, values, right))
     return AdjointFields(field, field * values)
 
@@ -165,16 +145,14 @@ def krylov(arm: ElasticArm, options: Options, start: np.ndarray | None = None) -
     Raises:
         ConvergenceError: fewer than q independent vectors, or a shift at a natural frequency.
     """
-    arm.profile.counts.reductions += 1
-    return ritz(arm, _recursion(arm, options).V)
+    return ritz(arm, _recursion(arm, options)[0])
 
 
 def krylov_adjoint(
     arm: ElasticArm,
     basis: Basis,
     options: Options,
-    interior: np.ndarray,
-    outboard: np.ndarray,
+    cotangents: Rows,
 ) -> AdjointFields:
     """Return the fields of `AdjointFields` for cotangents of V of a function of its span.
 
@@ -184,11 +162,10 @@ def krylov_adjoint(
 
     Args:
         arm, basis, options: of the current design.
-        interior: (num_interior, q) cotangents of the owned interior rows of V.
-        outboard: (b, q) cotangents of its outboard rows.
+        cotangents: (.., q) of the rows of V.
     """
-    recursion = _recursion(arm, options)
-    turn = dot(arm, recursion.MV, basis.V)  # basis.V = V turn, an orthogonal matrix
+    (_, MV, blocks), (interior, outboard) = _recursion(arm, options), cotangents
+    turn = dot(arm, MV, basis.V)  # basis.V = V turn, an orthogonal matrix
     # Within the span a trajectory that is right to its tolerance leaves cotangents that are not
     # quite zero, and the recursion would amplify them.
     inner = total(arm.comm, interior_rows(arm, basis.V).T @ interior)
@@ -198,14 +175,14 @@ def krylov_adjoint(
     outboard = (outboard - weighted[1] @ inner) @ turn.T
     stiffness, mass = np.zeros_like(basis.V), np.zeros_like(basis.V)
     frame = np.zeros_like(frame_fields(arm))
-    for block in reversed(recursion.blocks):
+    for block in reversed(blocks):
         kept, H = block.expansion.kept, block.expansion.coefficients[:, block.expansion.kept]
         old, new = slice(0, len(H) - len(kept)), slice(len(H) - len(kept), len(H))
         inverse = np.linalg.inv(H[new])
-        cotangents = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
-        interior[:, old] -= cotangents[0] @ H[old].T
-        outboard[:, old] -= cotangents[1] @ H[old].T
-        mu = solve_at(arm, block.omega, cotangents)
+        own = interior[:, new] @ inverse.T, outboard[:, new] @ inverse.T
+        interior[:, old] -= own[0] @ H[old].T
+        outboard[:, old] -= own[1] @ H[old].T
+        mu = solve_at(arm, block.omega, own)
         paired = combine(mu, H.T)
         stiffness[:, :, : len(H)] += paired
         mass[:, :, : len(H)] += block.omega**2 * paired
@@ -233,26 +210,19 @@ class _Block:
     expansion: Expansion  # of K_w^-1 f in V, its new columns included
 
 
-@dataclass(frozen=True, eq=False)
-class _Recursion:
-    """M-orthonormal V (n_nodes, d, q), M V, and the blocks that made them, in their order."""
-
-    V: np.ndarray
-    MV: np.ndarray
-    blocks: list[_Block]
+_Chain = tuple[float, _Group | None, np.ndarray]  # shift, inputs and which of them, see `_Block`
 
 
-def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
-    """Build exactly q columns."""
+def _recursion(arm: ElasticArm, options: Options) -> tuple[np.ndarray, np.ndarray, list[_Block]]:
+    """Return M-orthonormal V (n_nodes, d, q), M V, and the blocks that made them, in order."""
     V = MV = np.empty((*arm.points.shape, 0))
     blocks: list[_Block] = []
     omegas = [2.0 * np.pi * shift for shift in options.shifts]
-    chains: list[tuple[float, _Group | None, np.ndarray]] = [
-        (omega, group, np.arange(columns))
-        for group, columns in (
-            (interface_loads, arm.rigid.shape[2]),
-            (frame_loads, 3 if arm.mesh.dim == 2 else 6),
-        )
+    groups = interface_loads, frame_loads
+    counts = arm.rigid.shape[2], 3 if arm.mesh.dim == 2 else 6
+    chains: list[_Chain] = [
+        (omega, group, np.arange(count))
+        for group, count in zip(groups, counts, strict=True)
         for omega in omegas
     ]
     while V.shape[2] < options.coordinates:
@@ -261,7 +231,7 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
                 f"arm {arm.mesh.name!r}: only {V.shape[2]} of {options.coordinates} Krylov vectors "
                 "are independent; ask for fewer reduction.coordinates or move reduction.frequencies"
             )
-        longer: list[tuple[float, _Group | None, np.ndarray]] = []
+        longer: list[_Chain] = []
         for omega, group, columns in chains:
             first = V.shape[2]
             while len(columns) and V.shape[2] < options.coordinates:
@@ -269,14 +239,13 @@ def _recursion(arm: ElasticArm, options: Options) -> _Recursion:
                 now, columns = np.split(columns, [options.coordinates - V.shape[2]])
                 right = group(arm) if group else arm.restrict(MV)
                 right = right[0][:, now], right[1][:, now]
-                raw = solve_at(arm, omega, right)
-                new = orthonormalise(arm, raw, V, MV)
+                new = orthonormalise(arm, solve_at(arm, omega, right), V, MV)
                 blocks.append(_Block(omega, group, now, new))
                 V, MV = np.concatenate([V, new.Q], axis=2), np.concatenate([MV, new.MQ], axis=2)
             if V.shape[2] > first:
                 longer.append((omega, None, np.arange(first, V.shape[2])))
         chains = longer
-    return _Recursion(V, MV, blocks)
+    return V, MV, blocks
 
 
 # -- by Gramians: the directions that inputs within a frequency band move most --------------------
@@ -306,7 +275,6 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     Raises:
         ConvergenceError: no convergence in the band, or fewer than q directions in it.
     """
-    arm.profile.counts.reductions += 1
     first = arm.static_response(*_inputs(arm))
     space = InverseSpace(arm, first)
     low, high = (2.0 * np.pi * frequency for frequency in options.band)
@@ -434,12 +402,12 @@ class Method:
 
     Attributes:
         reduce: (arm, options, start) -> basis.
-        adjoint: (arm, basis, options, cotangents interior, outboard) -> fields, see
-            `craig_bampton_adjoint`; None where there is none.
+        adjoint: (arm, basis, options, cotangents) -> fields, see `craig_bampton_adjoint`; None
+            where there is none.
     """
 
     reduce: Callable[[ElasticArm, Options, np.ndarray | None], Basis]
-    adjoint: Callable[[ElasticArm, Basis, Options, np.ndarray, np.ndarray], AdjointFields] | None
+    adjoint: Callable[[ElasticArm, Basis, Options, Rows], AdjointFields] | None
 
 
 METHODS = {

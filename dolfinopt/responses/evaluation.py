@@ -115,7 +115,7 @@ def evaluate(
         for index, arm in arms.items():
             if index not in x_phys:
                 raise InputError(f"arm {arm.mesh.name!r}: expected densities")
-            arm.set_design(x_phys[index])
+            arm.state(x_phys[index])
     motion, trajectory = Motion(), None
     if simulated or needs(scene, "motion"):
         scenes = [scene, *pose_scenarios(scene)]

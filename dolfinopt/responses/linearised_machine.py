@@ -53,7 +53,7 @@ def linearised_machine(
     check_instant(scene, t)
     with together(partition.world):
         for k, arm in arms.items():
-            arm.set_design(x_phys[k])
+            arm.state(x_phys[k])
     decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
     reductions = Reductions(scene, partition, arms, profile)
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.arms.design_state import options
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
 from dolfinopt.errors import ConvergenceError
@@ -127,7 +128,7 @@ class Comparison:
         self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
         with together(partition.world):
             for k, arm in arms.items():
-                arm.set_design(x_phys[k])
+                arm.state(x_phys[k])
         decide_stiffening(self.scenes, partition, arms)
         self.reductions = Reductions(scene, partition, arms, profile)
         self.richer = 0  # coordinates
@@ -229,7 +230,8 @@ class Reductions:
         reduce = METHODS[method].reduce
         with self.profile.phase("choice of coordinates"), together(self.partition.world):
             return {
-                k: reduce(arm.elastic, arm.options(count), None) for k, arm in self.arms.items()
+                k: reduce(arm.elastic, options(arm.scene, count), None)
+                for k, arm in self.arms.items()
             }
 
     def bodies(self, bases: Mapping[int, Basis]) -> dict[int, ShapeIntegrals]:

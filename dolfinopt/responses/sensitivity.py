@@ -92,9 +92,8 @@ def _body_products(
     interior, outboard = elastic.restrict(by_V)
     method = METHODS[state.scene.reduction.method]
     assert method.adjoint is not None  # the scene refuses the others
-    fields = method.adjoint(
-        elastic, basis, state.reduction_options, interior, outboard + cotangents.outboard
-    )
+    rows = interior, outboard + cotangents.outboard
+    fields = method.adjoint(elastic, basis, state.reduction_options, rows)
     partners.left[:, :, 1:-1] += fields.mass
     places = partners.by_points
     stiffness: list[Pair] = [(combine(V, by_K.T) - fields.stiffness, V)]

@@ -61,7 +61,7 @@ from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.joints import DRIVE_KEYS, INBOARD, OF_BEARINGS, OUTBOARD
 from dolfinopt.scene.tables.machine import Force, Joint
 from dolfinopt.scene.tables.material import material_keys
-from dolfinopt.scene.tables.motion import Motion, Reduction
+from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction
 from dolfinopt.scene.tables.objective import Objective, WorstBy
 from dolfinopt.scene.tables.responses import DECLARED
 
@@ -162,7 +162,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     _resolve_files(tree, source, changes)
     _drop_sizes(tree, sizes)
     _measure_bodies(tree, inherited)
-    derived = complete(tree, source, changes)
+    derived = complete(tree)
     try:
         scene = Scene.model_validate({key: tree[key] for key in tree if key != OLD})
     except ValidationError as error:
@@ -561,17 +561,14 @@ def _store(tree: dict[str, Any], loc: Loc, value: Any) -> None:
 Keys = tuple[tuple[str, str], ...]
 
 
-def complete(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys:
+def complete(tree: dict[str, Any]) -> Keys:
     """Complete lengths, times of the motion, number of coordinates, volume's limit and gradient.
 
     Returns:
         The keys that follow from others, as (table, key).
-
-    Raises:
-        InputError: a stated duration is too short for the limits.
     """
     measured = _measure_path(tree)  # by which the path's least duration is known
-    timed = _time_motion(tree, source, changes)
+    timed = _time_motion(tree)
     others = _count_coordinates(tree), _limit_volume(tree), _freeze_loads(tree)
     return *measured, *timed, *(key for keys in others for key in keys)
 
@@ -633,35 +630,24 @@ def _length(value: Any) -> int:
     return len(value) if isinstance(value, list | tuple) else 0
 
 
-def _time_motion(tree: dict[str, Any], source: str, changes: list[Override]) -> Keys:
+def _time_motion(tree: dict[str, Any]) -> Keys:
     """Complete duration and horizon where they follow from others; return their (table, key)."""
     motion = tree.get("motion")
     if not isinstance(motion, dict):
         return ()
-    asked = ("file", "max_speed", "max_acceleration", "max_jerk")
+    asked = ("file", *LIMITS)
     derived: list[tuple[str, str]] = []
-    if any(motion.get(key) is not None for key in asked):
-        from dolfinopt.scene.duration import SAME_TIME, least_duration  # NumPy, only needed here
+    if motion.get("duration") is None and any(motion.get(key) is not None for key in asked):
+        from dolfinopt.scene.duration import least_duration  # NumPy, only needed here
 
         rest = {key: motion[key] for key in motion if key not in ("duration", "horizon")}
         try:
-            least, limited = least_duration(Motion.model_validate({**rest, "horizon": 1e5}))
+            least, _ = least_duration(Motion.model_validate({**rest, "horizon": 1e5}))
         except (ValidationError, InputError):  # told where the scene is checked, or its motion
-            least, limited = None, False
-        stated = motion.get("duration")
-        if stated is None and least:  # of a table with one row the motion tells
+            least = None
+        if least:  # of a table with one row the motion tells
             motion["duration"] = least
             derived.append(("motion", "duration"))
-        if not (limited and isinstance(stated, (int, float)) and least is not None):
-            pass  # what the duration is, validation will say
-        elif stated < least * (1.0 - SAME_TIME):
-            where = blamed(source, changes, (("motion", "duration"),))
-            keys = ", ".join(f"motion.{k}" for k in asked[1:] if motion.get(k) is not None)
-            raise input_error(
-                where,
-                f"motion.duration = {shown(stated)}: expected at least {least:.6g} [s] by the "
-                f"limits ({keys}); leave it out to use this value, or raise the limits",
-            )
     duration = motion.get("duration")
     default = Motion.model_fields["horizon"].default
     moving = motion.get("table_ends") == "moving"

@@ -114,7 +114,8 @@ OLD_WORDS = (
     OldWord(
         "arms.symmetric_z", 'arms.symmetric = "z", "yz" about both planes', _symmetric_z, False
     ),
-    OldWord("arms.hull", "arms.section = its file", _renamed("section")),
+    OldWord("arms.hull", "arms.hollow = its file", _renamed("hollow")),
+    OldWord("arms.section", "arms.hollow = the section", _renamed("hollow")),
     OldWord("arms.inboard_bore", 'an entry "inboard" of [[arms.interfaces]]', _bore(INBOARD)),
     OldWord("arms.outboard_bore", 'an entry "outboard" of [[arms.interfaces]]', _bore(OUTBOARD)),
     OldWord(
@@ -129,6 +130,8 @@ OLD_WORDS = (
     OldWord("control.damping_factor", "control.damping times it", _scaled("damping"), 1.0),
     OldWord("optimizer.exact_iterations", 'objective.gradient = "exact"', _exact, 0),
     OldWord("simulation.integrator", "every motion is integrated by Radau IIA", None, "radau"),
+    OldWord("part.curves", "parts have lines, arcs and circles", None, "splines"),
+    OldWord("part.simplify", "parts have lines, arcs and circles", None, False),
     OldWord("simulation.rho_inf", "every motion is integrated by Radau IIA", None, 0.8),
     *(OldWord(f"constraints.{old}", f"constraints.{key}", _renamed(key))
       for old, key in OLD_LIMITS.items()),

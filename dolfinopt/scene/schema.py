@@ -11,7 +11,7 @@ import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
 
@@ -20,7 +20,7 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import Arm
-from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in, without_none
+from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in
 from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
@@ -377,13 +377,16 @@ FILE_KEYS = tuple(
     (table, key)
     for table, field in Scene.model_fields.items()
     for key, value in getattr(table_in(field.annotation), "model_fields", {}).items()
-    if NAMES_FILE in getattr(without_none(value.annotation), "__metadata__", ())
+    if any(
+        NAMES_FILE in getattr(kind, "__metadata__", ())
+        for kind in (value.annotation, *get_args(value.annotation))
+    )
 )
 
 
 def file_in(key: str, value: str) -> bool:
     """Return whether the value of one of `FILE_KEYS` is a file, not a word as "tube" is."""
-    return key != "section" or Path(value).suffix != ""
+    return key != "hollow" or Path(value).suffix != ""
 
 
 # -- the keys of a scene as JSON schema, from which editors complete and check scene files -------
@@ -396,7 +399,7 @@ def scene_schema() -> dict[str, Any]:
 
     It knows keys, types and ranges; what depends on several keys is checked when a scene is read.
     """
-    schema = _plain(Scene.model_json_schema())
+    schema = _plain(Scene.model_json_schema(ref_template="#/definitions/{model}"))
     schema["definitions"] = schema.pop("$defs")
     schema["required"].remove("name")  # by default the file's
     schema["properties"]["arms"]["minItems"] = 1
@@ -431,8 +434,6 @@ def _plain(node: Any) -> Any:
             found[key] = {name: _plain(item) for name, item in value.items()}
         elif key == "prefixItems":
             found["items"] = _plain(value)
-        elif key == "$ref":
-            found[key] = value.replace("#/$defs/", "#/definitions/")
         elif key != "title" and (key, value) != ("default", None):
             found[key] = _plain(value)
     return found

@@ -27,8 +27,8 @@ def flexibility(section: str, size: tuple[float, float, float], cells) -> np.nda
     length, height, thickness = size
     t = min(height, thickness) / 40.0
     arm = solid_arm(
-        SELF, length=length, height=height, thickness=thickness, cells=cells, hollow=True,
-        section=section, wall=t, min_wall=0.5 * t, max_wall=4.0 * t, passive=0.0,
+        SELF, length=length, height=height, thickness=thickness, cells=cells, hollow=section,
+        wall=t, min_wall=0.5 * t, max_wall=4.0 * t, passive=0.0,
     )  # fmt: skip
     found = static_response(arm.state(arm.uniform()).elastic, LOADS).tip
     return found[[1, 2, 0, 3], range(4)]
@@ -129,7 +129,7 @@ def test_short_wide_boxes(size, cells, lag):
 KEYS = ("wall=0.002", "min_wall=0.001", "max_wall=0.005", "hollow=true")
 COARSE = (
     *(f"arms.{link}.{key}" for link in ("link1", "link2") for key in KEYS),
-    "arms.link1.cells=[5,2,1]", "arms.link2.cells=[5,2,2]", "arms.link2.section=tube",
+    "arms.link1.cells=[5,2,1]", "arms.link2.cells=[5,2,2]", "arms.link2.hollow=tube",
     "arms.link2.height=0.02", "arms.link2.passive=0", "simulation.tolerance=1e-4",
     "objective.gradient=exact", "design.filter_radius=0.05", "design.initial=0.5",
 )  # fmt: skip

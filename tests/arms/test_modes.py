@@ -96,7 +96,7 @@ NOTHING, BODY = np.zeros((3, 3)), carried_by(3.0, 0.4, -0.8 / 3.0, 0.8)
 def test_dense_eigenproblem(carried: np.ndarray) -> None:
     """Any design on a small mesh; unit modal mass, carried mass included."""
     arm = arm_of((9, 3), "arms.height=0.2")
-    arm.set_design(design_of(arm))
+    arm.state(design_of(arm))
     modes = loaded_modes(arm.elastic, carried, 5, None)
     young, density = arm.solid.young_modulus, arm.solid.density
     K, M = dense_matrices(
@@ -118,12 +118,12 @@ def test_an_arm_cut_in_two() -> None:
     values, floating = [], []
     for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
         arm = arm_of((24, 3), comm=comm)
-        arm.set_design(design_of(arm))
+        arm.state(design_of(arm))
         values.append(loaded_modes(arm.elastic, BODY, 3, None).values)
         arm = arm_of((60, 6), "interpolation.floor=1e-9", comm=comm)
         stripes = design_of(arm, lambda k, x, y: np.floor(12.0 * x) % 2.0 == 0.0)
-        arm.set_design(stripes.astype(float))
-        floating.append(np.linalg.inv(arm.elastic.constraint_modes().stiffness))
+        arm.state(stripes.astype(float))
+        floating.append(np.linalg.inv(arm.elastic.constraint_modes.stiffness))
     np.testing.assert_allclose(values[1], values[0], rtol=1e-9)
     scale = np.sqrt(np.outer(np.diag(floating[0]), np.diag(floating[0])))
     np.testing.assert_allclose(floating[1] / scale, floating[0] / scale, atol=1e-4)
@@ -141,7 +141,7 @@ def symmetric(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def stubby() -> Arm:
     """Return an arm three times as high as long, of the symmetric design."""
     arm = arm_of((8, 8), *STUBBY)
-    arm.set_design(design_of(arm, symmetric))
+    arm.state(design_of(arm, symmetric))
     return arm
 
 
@@ -176,7 +176,7 @@ def slopes_at(
     start = loaded_modes(arm.elastic, carried, 3, None).start
 
     def modes(x: np.ndarray) -> LoadedModes:
-        arm.set_design(x)
+        arm.state(x)
         return loaded_modes(arm.elastic, carried, 3, start)
 
     x = design_of(arm, symmetric)
@@ -249,7 +249,7 @@ def test_first_frequency_is_that_of_all_elements(name: str) -> None:
     scene = do.load_scene(path, ["reduction.coordinates=3"] * (demo == "two_arm") + overrides)
     index = next(iter(scene.cell_counts))
     arm = Arm(scene, index, MPI.COMM_WORLD, do.Profile())
-    arm.set_design(arm.uniform(0.5))
+    arm.state(arm.uniform(0.5))
     nothing = np.zeros((arm.current.elastic.rigid.shape[2],) * 2)
     expected = loaded_modes(arm.elastic, nothing, 1, None).frequency
     assert arm.current.body.first_frequency / expected - 1.0 >= excess - 1e-9

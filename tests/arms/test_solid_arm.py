@@ -123,7 +123,7 @@ def test_three_interfaces():
     """Mirrored in y = 0 the two on the sides change places: their stiffness, too, to rounding."""
     arm = solid_arm(cells=(10, 4, 2), coordinates=18, interfaces=FORK)
     state = arm.state(arm.mesh.keep(np.full(arm.mesh.num_cells, 0.5)))
-    S, body = state.elastic.constraint_modes().stiffness, state.body
+    S, body = state.elastic.constraint_modes.stiffness, state.body
     mirror = np.kron([[1, 0, 0], [0, 0, 1], [0, 1, 0]], np.diag([1, -1, 1, -1, 1, -1]))
     assert np.abs(mirror @ S @ mirror.T - S).max() < 1e-12 * np.abs(S).max()
     assert np.array_equal(body.outboard, np.eye(18)) and np.array_equal(body.K, S)
@@ -140,7 +140,7 @@ def test_force_between_the_ends():
     """A beam loaded at a section between its ends: deflections there and, beyond it, of the end."""
     ring = Interface(name="ring", point=(0.2625, 0.0, 0.0), radius=0.021)  # a layer of cells
     arm = solid_arm(cells=(20, 4, 2), coordinates=12, interfaces=(ring,))
-    S = arm.state(np.ones(arm.mesh.num_cells)).elastic.constraint_modes().stiffness
+    S = arm.state(np.ones(arm.mesh.num_cells)).elastic.constraint_modes.stiffness
     moved = np.linalg.inv(S)[:, 7]  # by 1 N along y at the ring
     bending = YOUNG * THICKNESS * HEIGHT**3 / 12.0
     a = ring.point[0]

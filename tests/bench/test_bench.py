@@ -341,7 +341,7 @@ def test_links_that_do_not_fit_are_left_out(monkeypatch):
 CASES = {case.name: case for case in field.read_cases()}
 
 
-@pytest.mark.parametrize("name", [case.name for case in field.chosen_cases([], False)])
+@pytest.mark.parametrize("name", [case.name for case in field.chosen_cases([])])
 def test_published_results_are_those_of_today(name):
     """Ours to a hundredth of the limit, or to 1e-4 where the limit is that of the problem."""
     for one in field.check(CASES[name]):
@@ -394,7 +394,7 @@ def test_wrong_case_files(tmp_path, change, told):
 
 def test_command(tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
-    run("bench", "field", "--case", "quanser", "--out", out)
+    run("bench", "field", "quanser", "--out", out)
     assert "1 values within their limits" in capsys.readouterr().out
     assert "met" in (out / "field.csv").read_text()
     missed = CASES["quanser"].values[0].unchecked_copy({"reference": 1.0})
@@ -408,13 +408,12 @@ def test_command(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("field", "--case", "sling"), ("--case", "sling", "rod")),
-        (("field", "--case", "rod", "--all"), ("--case", "all")),
+        (("field", "sling"), ("sling", "rod")),
+        (("field", "rod", "all"), ("all",)),
         (("field", "time"), ("field", "time")),
         (("field", "--quick"), ("field", "--quick")),
-        (("field", "--case", "ur10e"), ("--records", "dynamic_calibration")),
-        (("field", "--case", "ur10e", "--records", "nowhere"), ("nowhere", "ur10e.urdf")),
-        (("time", "--all"), ("--case", "field")),
+        (("field", "ur10e"), ("--records", "dynamic_calibration")),
+        (("field", "ur10e", "--records", "nowhere"), ("nowhere", "ur10e.urdf")),
     ],
 )
 def test_wrong_words(words, told):

@@ -26,8 +26,7 @@ from runs import (
 from scipy.io import loadmat
 
 import dolfinopt as do
-from dolfinopt.cli import shared
-from dolfinopt.cli.shared import plain_lines
+from dolfinopt.cli.shared import in_words, progress
 from dolfinopt.disk import RUN
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.folders import RUN_FILES
@@ -197,17 +196,6 @@ def test_the_scene_decides_which_gradient(shared_tmp_path, capsys, words, kind):
     assert (expected["esl"] < 0.0).all()  # under frozen loads more material is always stiffer
     if WORLD.rank == 0:
         assert f"{kind} gradient in" in capsys.readouterr().out
-
-
-@pytest.mark.serial
-def test_the_launchers_set_up_does_not_count(monkeypatch):
-    """The launcher's process, which may have installed everything, becomes the command's."""
-    monkeypatch.setenv("DOLFINOPT_STARTED", str(time.time() + 1e3))
-    assert shared._age() == 0.0
-    monkeypatch.setenv("DOLFINOPT_STARTED", "0")
-    with_all = shared._age()
-    monkeypatch.delenv("DOLFINOPT_STARTED")
-    assert shared._age() >= with_all  # of a later moment
 
 
 USED = {
@@ -442,13 +430,13 @@ def test_arm_of_a_file_without_geometric_stiffness(tmp_path, capsys, stiffening)
 @pytest.mark.serial
 def test_lines_without_a_terminal(capsys):
     """The first row's wait is no silence, either; the last row is repeated while nothing comes."""
-    with plain_lines(400, every=0.05) as show:
+    with progress(MPI.COMM_SELF, every=0.05) as say:
         deadline = time.monotonic() + 10.0
         text = ""
         while "setting up" not in text and time.monotonic() < deadline:
             time.sleep(0.01)
             text += capsys.readouterr().err
-        show(HistoryRow(7, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0))
+        say(in_words(HistoryRow(7, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0), 400))
         while text.count("7/400") < 2 and time.monotonic() < deadline:
             time.sleep(0.01)
             text += capsys.readouterr().err
@@ -460,8 +448,8 @@ def test_lines_without_a_terminal(capsys):
 
 @pytest.mark.serial
 def test_a_short_run_says_nothing(capsys):
-    with plain_lines(10, every=60.0) as show:
-        show(HistoryRow(1, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0))
+    with progress(MPI.COMM_SELF, every=60.0) as say:
+        say("1/10")
     assert capsys.readouterr().err == ""
 
 
@@ -501,7 +489,7 @@ def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys, write_scen
     """Both files hold the same matrices, with names, whatever the ranks; refusals write nothing."""
     path, out = write_scene(controlled()), shared_tmp_path / "run"
     run("simulate", path, *QUICK, "--out", out, "--no-plots")
-    run("export", out, "--state-space", 3.0)
+    run("export", out, "state-space", "--at", 3.0)
     run("export", path, *QUICK, "--state-space", 3.0, "--out", shared_tmp_path / "scene")
     folders = (out / "state-space", shared_tmp_path / "scene")
     first, second = (np.load(one / "state_space.npz") for one in folders)
@@ -521,11 +509,11 @@ def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys, write_scen
         assert "with its control, at 3 s: 22 states, 6 inputs, 7 outputs" in told
         assert f"poles below {float(first['accurate_below']):.4g} Hz hold 1 %" in told
     for words, expected in (
-        ([path, "--state-space", 5.0], "motion.horizon = 3"),
-        ([path, "--state-space", 1.0, "--urdf"], "--urdf"),
-        ([path, "--below", 100.0], "--state-space"),
-        ([out, "--state-space", 1.0, "--set", "payload.mass=2"], "--set"),
-        ([out], "--state-space T"),
+        ([path, "state-space", "--at", 5.0], "motion.horizon = 3"),
+        ([path, "state-space"], "--at"),
+        ([path, "--below", 100.0], "state-space, not with bodies"),
+        ([out, "state-space", "--at", 1.0, "--set", "payload.mass=2"], "--set"),
+        ([out], "add robot or state-space"),
     ):
         line = ["export", *words, "--out", shared_tmp_path / "none"]
         refusal(lambda line=line: run(*line), expected)

@@ -316,7 +316,7 @@ def test_geometry_is_mended(shapes, volume, done):
     for one in done:
         assert any(one in word for word in found.done), found.done
     assert done or found.done == ()
-    check_cells(found.points, found.cells[:, TENSOR[3, 8]])
+    check_cells(found.points, found.cells[:, TENSOR[8, 3]])
     assert 1500 < len(found.cells) < 20000
     if volume is not None:  # but for corners, and voxels of open surfaces
         assert found.volume == pytest.approx(volume, rel=0.06 if "fill" in str(done) else 0.01)

@@ -107,9 +107,9 @@ def test_a_links_inertia_is_its_bodys_and_its_motors():
 
 def test_export_says_what_it_cannot_write(tmp_path):
     for words, expected in (
-        ([], "--urdf"),
-        (["--urdf", "--set", "payload.mass=1"], "no --design and no --set"),
-        (["--urdf"], "summary.json"),
+        ([], "add robot"),
+        (["robot", "--set", "payload.mass=1"], "not with robot"),
+        (["robot"], "summary.json"),
     ):
         refusal(lambda: run("export", tmp_path, *words), expected)  # noqa: B023
     record = tmp_path / "robot.json"
@@ -177,7 +177,7 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     (beside / "sections.json").write_text(json.dumps({"question": question}))
     (beside / "sections.md").write_text("The lightest tube wins.\n")
     (beside / "sections.csv").write_text("section,mass [kg]\nround tube,2.5\n")
-    run("export", tmp_path / "run", "--urdf", "--before", tmp_path / "run")
+    run("export", tmp_path / "run", "robot", "--before", tmp_path / "run")
     said = capsys.readouterr().out
     assert "kg, was 7.879 kg" in said and "largest tool deflection" in said
     rows = pd.read_csv(tmp_path / "run" / "urdf" / "before_after.csv", index_col="figure")
@@ -229,7 +229,7 @@ def test_a_robot_is_never_replaced_by_the_new_one(tmp_path):
               "--no-plots")  # fmt: skip
     run("simulate", tmp_path / "a" / "robot.toml", "--out", tmp_path / "run", *coarse)
     for words in ((), ("--overwrite",)):
-        line = ["export", tmp_path / "run", "--urdf", "--out", source, *words]
+        line = ["export", tmp_path / "run", "robot", "--out", source, *words]
         refusal(lambda: run(*line), "robot.urdf", "name another")  # noqa: B023
     assert [path.name for path in source.iterdir()] == ["robot.urdf"]
     mesh = source / "forearm.stl"

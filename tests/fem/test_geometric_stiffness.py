@@ -106,7 +106,7 @@ def test_pulled_beam(dim):
     if dim == 3:
         arm, L = solid("incompatible", height, thickness, (25, 2, 2)), solids.LENGTH
         load, error = F_X, 0.035
-    K0 = unit_loads(arm).geometric_stiffness(arm.constraint_modes().field)[load]
+    K0 = unit_loads(arm).geometric_stiffness(arm.constraint_modes.field)[load]
     beam = np.zeros((6, 6))
     beam[0, 0] = 1.0 / L
     beam[1, 1] = beam[2, 2] = 6.0 / (5.0 * L)

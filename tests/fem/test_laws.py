@@ -76,8 +76,8 @@ def test_a_wound_tube(degrees):
     L, d, angle = 3.0, 0.12, np.radians(degrees)
     t = d / 60.0
     arm = solid_arm(
-        MPI.COMM_SELF, length=L, height=d, thickness=d, cells=(48, 6, 6), hollow=True,
-        section="tube", wall=t, min_wall=0.5 * t, max_wall=4.0 * t, passive=0.0,
+        MPI.COMM_SELF, length=L, height=d, thickness=d, cells=(48, 6, 6), hollow="tube",
+        wall=t, min_wall=0.5 * t, max_wall=4.0 * t, passive=0.0,
         angle=angle, **CARBON,
     )  # fmt: skip
     tip = static_response(arm.state(arm.uniform()).elastic, np.eye(6)[[0, 3]]).tip

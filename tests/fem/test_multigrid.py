@@ -75,7 +75,7 @@ def test_what_does_not_converge_is_told(iterative, monkeypatch):
     monkeypatch.setattr(multigrid, "SOLVER_ITERATIONS", 2)
     elastic = iterative.state(hollow(iterative, 0.1)).elastic
     with pytest.raises(ConvergenceError, match=r"interpolation\.floor.*pc_type cholesky"):
-        elastic.constraint_modes()
+        _ = elastic.constraint_modes
 
 
 @pytest.mark.serial
@@ -88,7 +88,7 @@ def test_contrast(direct, iterative):
     for void in (1e-3, 1e-6, 1e-9):
         young, density = (value * np.where(solid, 1.0, void) for value in (70e9, 2700.0))
         right, found = (
-            arm.substructure.at(young, density).constraint_modes().stiffness
+            arm.substructure.at(young, density).constraint_modes.stiffness
             for arm in (direct, iterative)
         )
         assert np.abs(found / right - 1.0).diagonal().max() < 1e-9

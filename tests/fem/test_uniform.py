@@ -81,7 +81,7 @@ def test_one_tensor_for_all_cells(monkeypatch, element) -> None:
     arm = make_arm(element)
     other = cell_by_cell(arm)
     assert len(arm.operators.geometric) == 1
-    V = np.concatenate([arm.constraint_modes().field, fields(arm, 1.0, 2)], axis=2)
+    V = np.concatenate([arm.constraint_modes.field, fields(arm, 1.0, 2)], axis=2)
     loads, others = unit_loads(arm), unit_loads(other)
     K0, expected = loads.geometric_stiffness(V), others.geometric_stiffness(V)
     # Bending stresses cancel across the arm, which costs some digits of each load's K0.

@@ -91,7 +91,7 @@ def arm_of(
     # Its motion may be out of reach.
     scene = read_scene(TWO_ARM, (f"arms.cells=[{cells[0]},{cells[1]}]", *overrides))
     arm = Arm(scene, index, comm, do.Profile())
-    arm.set_design(np.ones(arm.mesh.num_cells))
+    arm.state(np.ones(arm.mesh.num_cells))
     return arm
 
 

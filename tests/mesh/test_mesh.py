@@ -17,7 +17,7 @@ import dolfinopt as do
 from dolfinopt.arms.arm import Arm as ScenesArm
 from dolfinopt.data import mesh_folder
 from dolfinopt.mesh import compat, hollow
-from dolfinopt.mesh.arm_mesh import box_arm, interior_facets
+from dolfinopt.mesh.arm_mesh import box_arm, neighbours
 from dolfinopt.mesh.checks import cell_sizes, check_cells, facet_areas
 from dolfinopt.mesh.gmsh_session import DESIGN, INBOARD, OUTBOARD, PASSIVE
 from dolfinopt.mesh.hollow import FLAT_BAR, SOLID_BAR, member
@@ -117,30 +117,6 @@ def test_passive_cells_have_their_centre_within_the_passive_length(along, passiv
     if 2.0 * passive < 1.0:  # what a scene admits
         size = {"length": 1.0, "height": 0.06, "thickness": 0.01}
         assert Arm(name="a", **size, cells=(along, 2), passive=passive).passive_columns == columns
-
-
-@pytest.mark.parametrize("shape", ["quadrilateral", "triangle"])
-def test_interior_facets_against_brute_force(shape):
-    kind = getattr(dolfinx.mesh.CellType, shape)
-    corners = [np.zeros(2), np.array([1.0, 0.5])]
-    mesh = dolfinx.mesh.create_rectangle(COMM, corners, [5, 4], kind)
-    points = mesh.geometry.x
-    points[:, :2] += 0.03 * np.sin(9.0 * points[:, [1, 0]] + np.array([0.3, 1.1]))
-    cells = compat.cell_geometry_nodes(mesh, sum(compat.local_cell_counts(mesh)))
-    sets, middle = [set(nodes) for nodes in cells], points[cells].mean(axis=1)
-    expected = {}
-    for i in range(len(sets)):
-        for j in range(i):
-            shared = sorted(sets[i] & sets[j])
-            if len(shared) == 2:
-                a, b = points[shared]
-                expected[j, i] = (np.linalg.norm(a - b), np.linalg.norm(middle[i] - middle[j]))
-    first, second, length, distance = interior_facets(mesh)
-    found = {(min(i, j), max(i, j)): (a, b) for i, j, a, b in zip(first, second, length, distance)}
-    assert len(found) == len(first)
-    assert found.keys() == expected.keys()
-    for pair, figures in expected.items():
-        assert found[pair] == pytest.approx(figures, rel=1e-14)
 
 
 def test_area_of_distorted_cells():
@@ -301,7 +277,7 @@ def test_volume(kind, share):
     """Cells are valid and have the section's area, the circle's too, all along."""
     section = MESHED[kind]
     found = member(section, LENGTH, (HEIGHT, THICKNESS), share)
-    cells = found.cells[:, TENSOR[3, 8]]
+    cells = found.cells[:, TENSOR[8, 3]]
     check_cells(found.points, cells)
     area = section.area(HEIGHT, THICKNESS, share)
     assert area == pytest.approx(moments(kind, share)[0], rel=1e-12)
@@ -363,15 +339,15 @@ def test_box():
     assert mesh.passive.tolist() == (np.abs(mesh.centroid[:, 0] - 0.25) > 0.15).tolist()
 
 
-def test_facets_between_cells():
-    """All 10 x 4 x 2 cells' inner faces, once a rank that owns one of both cells."""
+def test_neighbours():
+    """Cells with a common face: their middles are one cell apart, in one direction."""
     mesh = box_arm(COMM, "a", SIZE, CELLS)
-    first, second, area, distance = interior_facets(mesh.mesh)
-    mine = np.minimum(first, second) < mesh.num_cells
-    owner = mesh.mesh.topology.index_map(3).local_to_global(first[mine].astype(np.int32))
-    assert np.allclose(area[mine] * distance[mine], 0.05 * 0.01 * 0.01)
+    pairs = neighbours(mesh.mesh)
+    corners = compat.cell_coordinates(mesh.mesh, sum(compat.local_cell_counts(mesh.mesh)))
+    apart = np.abs(np.diff(corners.mean(axis=1)[pairs], axis=1))[:, 0] / [0.05, 0.01, 0.01]
+    assert np.allclose(np.sort(apart), [0.0, 0.0, 1.0])
     if COMM.size == 1:
-        assert len(owner) == 9 * 8 + 10 * 3 * 2 + 10 * 4
+        assert len(pairs) == 9 * 8 + 10 * 3 * 2 + 10 * 4
 
 
 def test_volumes_of_skew_cells():

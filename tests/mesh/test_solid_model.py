@@ -208,8 +208,8 @@ HOLLOW = ("arms.link1.hollow=true", "arms.link1.wall=0.002")
 def test_the_wall_has_the_volume_of_its_section(hull, area):
     """To rounding: mitred corners of a box, and a circle's area of a polygon."""
     mesh = hull.member(WALL)
-    check_cells(mesh.points, mesh.cells[:, TENSOR[3, 8]])
-    assert cell_sizes(mesh.points[mesh.cells[:, TENSOR[3, 8]]]).sum() == pytest.approx(area * 0.5)
+    check_cells(mesh.points, mesh.cells[:, TENSOR[8, 3]])
+    assert cell_sizes(mesh.points[mesh.cells[:, TENSOR[8, 3]]]).sum() == pytest.approx(area * 0.5)
     assert len(mesh.inboard) == len(mesh.outboard) == hull.shape[1]
 
 
@@ -282,10 +282,13 @@ def test_ribs_are_rings_at_even_distances():
         ((*HOLLOW, "arms.link1.max_wall=0.01"), ("max_wall", "0.01", "less than half")),
         ((*HOLLOW, "arms.link1.min_wall=0.005"), ("min_wall", "less than max_wall")),
         ((*HOLLOW, "arms.link1.min_wall=0.003"), ("wall", "0.002", "min_wall = 0.003")),
-        ((*HOLLOW, "arms.link1.section=tube"), ("height", "0.04", "thickness = 0.02")),
+        ((*HOLLOW, "arms.link1.hollow=tube"), ("height", "0.04", "thickness = 0.02")),
         ((*HOLLOW, "arms.link1.extruded=true"), ("extruded", "none with hollow")),
         ((*HOLLOW, "arms.link1.element=quadratic"), ("element", "incompatible")),
         ((*HOLLOW, "arms.link1.cells=[60,60,40]"), ("cells", "at most 150", "200")),
+        ((*HOLLOW, "arms.link2.hollow=true", "arms.link2.wall=0.002", "interpolation.penalty=4",
+          "design.initial=0.5"),
+         ("interpolation.penalty", "3.0, the default", "solid")),
         ((*HOLLOW, "design.projection=heaviside"), ("projection", "false with a hollow arm")),
         ((*HOLLOW, "arms.link2.hollow=true", "arms.link2.wall=0.002", "design.initial=0.7"),
          ("design.initial", "0.7", "arms.wall")),
@@ -320,7 +323,7 @@ def hull_arm(tmp_path, mesh: Member, **keys):
     path = tmp_path / "hull.msh"
     path.write_bytes(msh_bytes(mesh))
     size = {"height": 0.06, "thickness": 0.04, "cells": (10, 4, 4)}
-    told = {"hollow": True, "section": str(path), "wall": 0.001, "passive": 0.0, "max_wall": 0.002}
+    told = {"hollow": str(path), "wall": 0.001, "passive": 0.0, "max_wall": 0.002}
     return solid_arm(MPI.COMM_SELF, **(size | told | keys))
 
 
@@ -339,7 +342,7 @@ def test_hull_of_a_file_lies_on_its_surface(tmp_path):
 def test_hulls_that_are_refused(tmp_path):
     """A surface behind another one, and a wall that would cross itself."""
     behind = box_hull((0.5, 0.06, 0.04), (6, 4, 4), 0.005).member(0.005)
-    with refused("hull.msh", "2 times", "star-shaped", "section"):
+    with refused("hull.msh", "2 times", "star-shaped", "hollow"):
         hull_arm(tmp_path, behind)
     with refused("arms.max_wall = 0.015", "crosses itself", "thinner"):
         hull_arm(tmp_path, taper(), max_wall=0.015)

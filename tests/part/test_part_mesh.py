@@ -110,7 +110,7 @@ def test_stress_at_a_hole_is_that_of_the_book(meshes, tmp_path):
         one = read_scene(TWO_ARM, ("arms.1.rigid=true", "design.filter_radius=0", *arm1))
         arm = Arm(one, 0, MPI.COMM_SELF, Profile())
         assert arm.mesh.area.sum() == pytest.approx(strip().area, rel=1e-6)
-        arm.set_design(np.ones(arm.mesh.num_cells))
+        arm.state(np.ones(arm.mesh.num_cells))
         corners, q = corner_stress_in_plane(arm.current), arm.current.load_fields.V.shape[2]
         at_hole = np.linalg.norm(corners.places - [0.5 * LENGTH, 0.0], axis=1) < 1.1 * RADIUS
         stress = np.linalg.norm(corners.A[:, :, q + 4], axis=0)  # of a unit force along the arm

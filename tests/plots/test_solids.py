@@ -10,8 +10,9 @@ from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.mesh.checks import cell_sizes
+from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.output.design import AROUND, ArmView, designed
+from dolfinopt.output.design import ArmView, designed
 from dolfinopt.part.solid.surface import surface_at
 from dolfinopt.plots import animation, solid_design, solid_machine
 from dolfinopt.plots.design import design_figure, stress_figure
@@ -30,7 +31,7 @@ def link(density):
     centroid = corners.mean(axis=1)
     modes = corners[..., None] * [1.0, 2.0]
     view = ArmView("link", corners, centroid, density(centroid), modes)
-    return replace(view, corners=corners[:, AROUND[8, 3]], modes=modes[:, AROUND[8, 3]])
+    return replace(view, corners=corners[:, TENSOR[8, 3]], modes=modes[:, TENSOR[8, 3]])
 
 
 def test_projected_area_of_a_link():
@@ -82,7 +83,7 @@ def test_surface_carries_fields_and_cells():
     middle = surface.corners.mean(axis=1)
     away = np.abs(middle - view.centroid[surface.cells]) * CELLS / SIZE
     assert away.max() <= 0.5 + 1e-5
-    corners = view.corners[:, AROUND[8, 3]]
+    corners = view.corners[:, TENSOR[8, 3]]
     volume = surface_at(corners, view.density, 0.5).volume
     assert volume == pytest.approx(cell_sizes(corners).sum() * (1.0 - 0.5 / 1.2), rel=1e-3)
 

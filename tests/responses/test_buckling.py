@@ -42,7 +42,7 @@ def bar(tmp_path_factory):
         f"arms.0.height={HEIGHT}", "arms.1.rigid=true", "design.filter_radius=0",
     )  # fmt: skip
     arm = build_arms(one, partition_arms(MPI.COMM_SELF, one.cell_counts), Profile())[0]
-    arm.set_design(np.ones(arm.mesh.num_cells))
+    arm.state(np.ones(arm.mesh.num_cells))
     young = one.material_of(0).young_modulus
     return arm.current, young * THICKNESS * HEIGHT**3 / 12.0
 
@@ -112,7 +112,7 @@ def test_void_in_a_closing_gap_does_not_buckle():
 
     def first(light: float, modulus: StressedModulus | None = None) -> tuple[float, float]:
         """Return the factor, and the share of the mode's energy in solid."""
-        arm.set_design(np.where(solid, 1.0, light))
+        arm.state(np.where(solid, 1.0, light))
         one = arm.current
         phi = buckling_modes(under(one, ACROSS, -100.0, modulus), 1)
         energy = one.elastic.cell_stiffness_products(phi.field, phi.field) * one.elastic.young

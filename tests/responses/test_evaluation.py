@@ -123,7 +123,7 @@ def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: lis
             K = body.K
             if owner is not None:
                 arm = built.arms[owner]
-                arm.set_design(x[owner] + h * d[owner])
+                arm.state(x[owner] + h * d[owner])
                 K = arm.elastic.energy_matrix(bases[owner].V)
                 q[:, part] = np.linalg.solve(K, body.K @ base.q_e[:, part].T).T
             e = q[where.indices, part]
@@ -204,7 +204,7 @@ def test_constraints_say_how_far_a_bound_is_exceeded() -> None:
     assert (1.0 + periods >= least * (1.0 - 1e-14)).all()  # equal but for rounding, if far apart
     assert (1.0 + periods <= least * 3.0 ** (1.0 / 20.0)).all()
     for k, arm in built.arms.items():
-        S = arm.elastic.constraint_modes().stiffness
+        S = arm.elastic.constraint_modes.stiffness
         largest = max(np.hypot(*np.linalg.solve(S, load)[:2]) for load in np.eye(3)[1:])
         assert largest / 1e-4 <= (1.0 + tips[k]) * (1.0 + 1e-14)
         assert 1.0 + tips[k] <= 2.0 ** (1.0 / 20.0) * largest / 1e-4
@@ -219,7 +219,7 @@ def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None
     first, _ = built.evaluate(x)
     for arm in built.arms.values():  # the second mode of both arms was the lowest once
         arm.initial_vectors = [start[:, ::-1] for start in arm.initial_vectors]
-        arm.set_design(np.ones(arm.mesh.num_cells))
+        arm.state(np.ones(arm.mesh.num_cells))
     second, _ = built.evaluate(x)
     assert second.objective < 0.5 * first.objective
     np.testing.assert_allclose(second.constraints, first.constraints, rtol=1e-9)

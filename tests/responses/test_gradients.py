@@ -506,7 +506,7 @@ def test_frozen_loads_by_nodes(base, shared_tmp_path) -> None:
             return size * (0.2 * noise(arm, x, 7) + h * noise(arm, x))
 
         arm = next(iter(built_with(scene, places, cut).arms.values()))
-        arm.set_design(np.ones(arm.mesh.num_cells))
+        arm.state(np.ones(arm.mesh.num_cells))
         elastic = arm.current.elastic
         nodes = elastic.interior_nodes  # in an order that moves may change
         if not loads:

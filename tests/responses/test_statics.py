@@ -45,8 +45,8 @@ def test_unit_loads_of_both_arms() -> None:
     for k in (0, 1):
         arm = Arm(built.scene, k, MPI.COMM_SELF, do.Profile())
         x, y = arm.mesh.centroid.T / arm.mesh.outboard_point[0]
-        arm.set_design(wave(k, x, y))
-        S = arm.elastic.constraint_modes().stiffness
+        arm.state(wave(k, x, y))
+        S = arm.elastic.constraint_modes.stiffness
         expected += np.linalg.inv(S)[1, 1] + np.linalg.inv(S)[2, 2]
     assert evaluation.objective == pytest.approx(expected, rel=1e-12)
     assert trajectory is None and np.isnan(evaluation.max_deviation)
@@ -140,7 +140,7 @@ def test_a_solid_link_takes_a_solve_for_a_load(width, loads, solves, interfaces)
         arm = static_link(tolerance=1e-10, **told)
         state = arm.state(holed(arm))
         if by_modes:
-            state.elastic.constraint_modes()
+            _ = state.elastic.constraint_modes
         before = arm.profile.counts.solves
         response = static_response(state.elastic, np.array(loads))
         slopes = static_gradient(state, response), deflection_gradient(state, response, 8.0)
@@ -192,7 +192,7 @@ def test_soft_designs_are_judged_by_constraint_modes(width) -> None:
         elastic = arm.substructure.at(young, np.ones_like(young))
         before = arm.profile.counts.solves
         static_response(elastic, np.eye(6)[1:2])
-        assert elastic.has_constraint_modes == soft
+        assert ("constraint_modes" in vars(elastic)) == soft
         assert arm.profile.counts.solves - before == (6 if soft else 1)
 
 

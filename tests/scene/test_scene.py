@@ -308,8 +308,8 @@ BAD_VALUES = [
     ("arms.0.extruded", [True], "only with a solid arm"),
     ("arms.0.hollow", [1], FLAGS),
     ("arms.0.hollow", [True], "false without cells = [nx, ny, nz]"),
-    ("arms.0.section", ["oval"], "only with hollow = true"),
-    ("arms.0.section", ["absent.msh"], "found neither /"),
+    ("arms.0.hollow", ["oval"], "false without cells = [nx, ny, nz]"),
+    ("arms.0.hollow", ["absent.msh"], "found neither /"),
     ("arms.0.wall arms.0.min_wall arms.0.max_wall", [0.01], "only with hollow = true"),
     ("arms.0.ribs", [2], "only with hollow = true"),
     ("arms.0.passive", [0.5], "less than half of length = 1.0 [m]"),
@@ -403,8 +403,6 @@ BAD_VALUES = [
     ("part.tool_radius", [-1e-9], ">= 0"),
     ("part.tolerance", [0.0], ">= 1e-06"),
     ("part.optimize", [1], "true or false"),
-    ("part.simplify", [1], "true or false"),
-    ("part.curves", ["lines"], "splines"),
     ("design.volume_fraction design.initial optimizer.move", [0.0, 1.01],
      "a number >= 1e-06 and <= 1"),
     ("design.minimum", [0.0], "a number >= 1e-09 and < 1"),
@@ -822,9 +820,16 @@ def test_every_option_of_a_response_is_used_by_one():
     [
         (["simulation.integrator=generalized-alpha"], ["simulation.integrator"]),
         (["simulation.rho_inf=0.5", "arms.joint_stiffness=1e4"], ["gear_stiffness", "rho_inf"]),
-        (["simulation.integrator=radau"], []),
+        (["part.curves=arcs", "part.simplify=true"], ["part.curves", "part.simplify"]),
+        (["simulation.integrator=radau", "part.curves=splines"], []),
     ],
 )
 def test_older_words_are_told_in_one_line(change, told):
     sentences = [one for one in implausible(read_scene(TWO_ARM, change)) if "older" in one]
     assert len(sentences) == bool(told) and all(word in sentences[0] for word in told)
+
+
+def test_the_section_of_a_hollow_arm_by_its_older_word():
+    scene = TWO_ARM.with_name("hollow_links.toml")
+    old = read_scene(scene, ["arms.link2.section=tube"])
+    assert old.arms == read_scene(scene).arms and "arms.section" in old.old_words[0]

@@ -488,7 +488,7 @@ def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
     try:
         tree = safe_xml(file)
     except (OSError, etree.XMLSyntaxError) as error:
-        raise InputError(f"{file}: cannot be read ({error}); --urdf needs the robot") from None
+        raise InputError(f"{file}: cannot be read ({error}); export needs the robot") from None
     by_name = {one.get("name"): one for one in tree.getroot().iterfind("link")}
     for mesh in tree.getroot().iter("mesh"):
         name = mesh.get("filename", "")

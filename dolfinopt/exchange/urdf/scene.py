@@ -301,7 +301,7 @@ class RobotScene:
         table = np.column_stack([t, rows[:, kept]])
         lines += [",".join(map(repr, map(float, row))) for row in table]
         new[folder / TRAJECTORY] = "\n".join(lines) + "\n"
-        # What `export --urdf` needs: the file, and every solid's link and frame.
+        # What `export RUN robot` needs: the file, and every solid's link and frame.
         urdf = Path(os.path.relpath(self.robot.file.absolute(), folder.absolute())).as_posix()
         solids = {
             self.arms[body.link]: {"link": body.link, "frame": body.frame.tolist()}
@@ -344,7 +344,7 @@ def read_origin(table: Path) -> Origin:
         return Origin(record.parent / data["urdf"], links, frames)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
-            f"{record}: cannot be read ({type(error).__name__}); --urdf needs this file, which "
+            f"{record}: cannot be read ({type(error).__name__}); export needs this file, which "
             "`dolfinopt import` writes beside the scene"
         ) from None
 

@@ -105,7 +105,7 @@ MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error
 SECTIONS = ("box", "tube")
 SectionOrFile = Annotated[str, NAMES_FILE, Field(json_schema_extra={"examples": list(SECTIONS)})]
 WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
-WALL_KEYS = ("section", "wall", "min_wall", "max_wall", "ribs")
+WALL_KEYS = ("wall", "min_wall", "max_wall", "ribs")
 RIB_LENGTH, RIB_PITCH = 2, 4  # cells along a hollow arm: of a rib; from one to the next at least
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
@@ -212,17 +212,13 @@ class Arm(Table):
         default=False,
         description="keep the design of a solid arm made of cells the same over the thickness [-]",
     )
-    hollow: bool = Field(
+    hollow: bool | SectionOrFile = Field(
         default=False,
         description="a thin-walled link of the arm's extents: the outer surface stays, the design "
-        "is the thickness of the wall; in space, with cells = [nx, ny, nz], of which those on the "
-        "surface count [-]",
-    )
-    section: SectionOrFile | None = Field(
-        default=None,
-        description='section of a hollow arm: "box" by default; "tube" is round, height = '
-        "thickness; or a mesh file (.msh) of a solid whose outer surface the arm has, which every "
-        "ray from the arm's axis meets once [-]",
+        'is the thickness of the wall; true or "box"; "tube" is round, height = thickness; or a '
+        "mesh file (.msh) of a solid whose outer surface the arm has, which every ray from its "
+        "axis meets once; in space, with cells = [nx, ny, nz], of which those on the surface count "
+        "[-]",
     )
     wall: WallThickness | None = Field(
         default=None, description="initial thickness of the wall of a hollow arm [m]"
@@ -396,11 +392,11 @@ class Arm(Table):
         """Refuse limits of the wall that leave no room or no hollow."""
         least, most = self.wall_limits
         if self.hull is not None and Path(self.hull).suffix.lower() != ".msh":
-            words = " | ".join(map(shown, SECTIONS))
-            raise Refusal(f"expected {words}, or a file that ends in .msh", ("section",))
-        if self.section == "tube" and self.height != self.thickness:
+            words = " | ".join(map(shown, (True, *SECTIONS)))
+            raise Refusal(f"expected {words}, or a file that ends in .msh", ("hollow",))
+        if self.hollow == "tube" and self.height != self.thickness:
             raise Refusal(
-                f'expected thickness = {self.thickness} [m], the diameter, with section = "tube"',
+                f'expected thickness = {self.thickness} [m], the diameter, with hollow = "tube"',
                 ("height",),
                 ("thickness",),
             )
@@ -429,7 +425,8 @@ class Arm(Table):
     @property
     def hull(self) -> str | None:
         """Mesh file of the solid whose outer surface a hollow arm has; None of a box or a tube."""
-        return None if self.section in (None, *SECTIONS) else self.section
+        is_file = isinstance(self.hollow, str) and self.hollow not in SECTIONS
+        return str(self.hollow) if is_file else None
 
     @property
     def wall_limits(self) -> tuple[float, float]:

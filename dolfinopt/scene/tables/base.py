@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -111,6 +111,13 @@ class Table(BaseModel):
         if get_origin(annotation) is Literal and value is not None and type(value) not in types:
             raise ValueError
         return value
+
+
+def refuse_count(values: object, names: Sequence[str], at: Loc) -> None:
+    """Raise Refusal for an array that has not one number for each of the names."""
+    if isinstance(values, tuple) and len(values) != len(names):
+        number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
+        raise Refusal(f"expected {number}, for {', '.join(names)}", at)
 
 
 def problem(error: ValidationError) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, model_validator
 
-from dolfinopt.scene.tables.base import MAX_ITERATIONS, Length, Loc, Position, Refusal, Table
+from dolfinopt.scene.tables.base import MAX_ITERATIONS, Length, Loc, Position, Refusal, Table, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -233,14 +233,19 @@ class Design(Table):
                 ("design", "projection"),
                 ("arms", hollow[0], "hollow"),
             )
-        if len(hollow) == len(scene.designed):
-            default = type(self).model_fields["initial"].default
-            if self.initial != default:
+        if not hollow or len(hollow) < len(scene.designed):
+            return
+        rows = [("interpolation", key) for key in type(scene.interpolation).model_fields]
+        for table, key in (("design", "initial"), *rows):
+            one = getattr(scene, table)
+            default = type(one).model_fields[key].default
+            if getattr(one, key) != default:
+                words = {"initial": "arms.wall is the initial thickness"}
                 raise Refusal(
-                    f"expected {default}, the default, where all arms are hollow: arms.wall is the "
-                    "initial thickness",
-                    ("design", "initial"),
-                    ("arms", hollow[0], "wall"),
+                    f"expected {shown(default)}, the default, where all arms are hollow: "
+                    f"{words.get(key, 'cells are solid')}",
+                    (table, key),
+                    ("arms", hollow[0], "hollow"),
                 )
 
     def _check_member_width(self, scene: Scene) -> None:
@@ -500,13 +505,6 @@ class Part(Table):
         default=None,
         description="smallest width of members of a part; default: design.minimum_member, or 0.001 "
         "[m]",
-    )
-    curves: Literal["splines", "arcs"] = Field(
-        default="splines", description="without effect: parts have lines, arcs and circles [-]"
-    )
-    simplify: bool = Field(
-        default=False,
-        description="without effect: sides are straight, with fillets between them [-]",
     )
     optimize: bool = Field(
         default=False,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from dolfinopt.scene.tables.arms import Moment, Tensor, check_arm_name, tensor_problem
-from dolfinopt.scene.tables.base import FileName, Loc, Position, Refusal, Table, shown
+from dolfinopt.scene.tables.base import FileName, Loc, Position, Refusal, Table, refuse_count, shown
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
     FRICTION_SPEED,
@@ -42,7 +42,7 @@ LIMITS = ("position_limits", "velocity_limit", "effort_limit")
 GROUND = "ground"
 PATHS = ("joints", "points", "line")  # of machines in space
 # What a machine in the plane has instead of joints.
-PLANE_KEYS = ("base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
+PLANE_KEYS = ("base", "base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
 
 
 def check_joint_name(name: str) -> str:
@@ -312,12 +312,8 @@ class Control(Table):
             raise Refusal(
                 'expected "rigid" without feed_forward.kind = "tip"', (*at, "feed_forward")
             )
-        names = scene.driven
         for key in ("stiffness", "damping", "limits"):
-            values = getattr(self, key)
-            if values is not None and len(values) != len(names):
-                number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
-                raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))
+            refuse_count(getattr(self, key), scene.driven, (*at, key))
 
 
 # -- `[damping]` ---------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import (
     Duration,
     FileName,
@@ -35,6 +36,7 @@ SHAPE_LIMIT = 0.2  # of coefficients: shares of the way by which a law may run a
 ShapeCount = Annotated[int, Field(ge=0, le=8)]
 Coefficient = Annotated[float, Field(ge=-SHAPE_LIMIT, le=SHAPE_LIMIT)]
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
+LIMITS = ("max_speed", "max_acceleration", "max_jerk")
 
 
 OF_PATH = "path_speed", "path_acceleration", "path_jerk"  # limits of a law with variables
@@ -185,9 +187,9 @@ class Motion(Table):
         self.refuse_unused(not joints, "path", "cart_follow", "elbow")
         if self.path == "rotation" and self.base != "fixed":
             raise Refusal('expected "fixed" with motion.path = "rotation"', ("base",), ("path",))
-        self._check_law()
         self.refuse_unused(self.base == "cart", "base", "cart_follow", "cart_mass")
         self.refuse_unused(self.base == "fixed", "base", "base_position")
+        self._check_law()
         return self
 
     def _check_law(self) -> None:
@@ -195,8 +197,7 @@ class Motion(Table):
         profile = self.law in ("trapezoidal", "s-curve")
         self.refuse_unused(profile, "law", "acceleration_share")
         self.refuse_unused(self.law != "trapezoidal", "law", "max_jerk")
-        limits = ("max_speed", "max_acceleration", "max_jerk")
-        self.refuse_unused(self.path not in ("joints", "rotation"), "path", *limits)
+        self.refuse_unused(self.path not in ("joints", "rotation"), "path", *LIMITS)
         last = "max_jerk" if self.law == "s-curve" else "max_acceleration"
         share = type(self).model_fields["acceleration_share"].default
         if profile and getattr(self, last) is not None and self.acceleration_share != share:
@@ -243,6 +244,25 @@ class Motion(Table):
             )
         return self
 
+    def _check_limits(self) -> None:
+        """Refuse a duration in which the limits cannot be kept."""
+        limits = [key for key in LIMITS if getattr(self, key) is not None]
+        if not limits:
+            return
+        from dolfinopt.scene.duration import SAME_TIME, least_duration  # NumPy, only needed here
+
+        try:
+            least, limited = least_duration(self)
+        except InputError:  # told by whoever reads the table
+            return
+        if limited and least is not None and self.duration < least * (1.0 - SAME_TIME):
+            raise Refusal(
+                f"expected at least {least:.6g} [s] by the limits ({', '.join(limits)}); leave it "
+                "out to use this value, or raise the limits",
+                ("motion", "duration"),
+                *(("motion", key) for key in limits),
+            )
+
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
         if self.table_ends == "moving" and self.horizon > self.duration:
@@ -262,6 +282,7 @@ class Motion(Table):
                         f"law by motion.max_{key[5:]}",
                         ("constraints", key),
                     )
+        self._check_limits()
         if scene.is_spatial:
             return  # `tables.joints` knows
         for key in ("gravity", "start", "end"):

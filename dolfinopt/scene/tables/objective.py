@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
-from dolfinopt.scene.tables.base import Loc, Refusal, Table, shown
+from dolfinopt.scene.tables.base import Loc, Refusal, Table, refuse_count, shown
 from dolfinopt.scene.tables.responses import (
     DECLARED,
     LARGEST_LOAD,
@@ -341,11 +341,8 @@ class ConstraintOptions(Table):
             "first_frequency": [arm.name for arm in scene.arms if arm.flexible],
             "tip_deflection": [scene.arms[i].name for i in scene.cell_counts],
         }
-        for key, limit in self.limits.items():
-            names = owners.get(key, [])
-            if key in owners and isinstance(limit, tuple) and len(limit) != len(names):
-                number = "1 number" if len(names) == 1 else f"{len(names)} numbers"
-                raise Refusal(f"expected {number}, for {', '.join(names)}", (*at, key))
+        for key, names in owners.items():
+            refuse_count(getattr(self, key), names, (*at, key))
         for index, one in enumerate(vars(self)["stiffness"] or ()):
             one.check_in_scene(scene, (*at, "stiffness", index))
         self._check_delay(scene.motion, (*at, "settling_after"))

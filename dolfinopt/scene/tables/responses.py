@@ -133,7 +133,7 @@ class Declaration:
         options: keys of [objective] or [constraints] that it uses as objective.
         objective: whether it can be the objective.
         stands_for: what the true values are, where they are another quantity than the objective.
-        natural: what is sought of the true value as objective, if the scene does not say.
+        natural: whether the objective is minimised or maximised if the scene does not say.
         exact: whether equivalent static loads say nothing of it: its gradient is the exact one.
         lighter: whether it falls with the mass, down to that of no arm at all.
         of_nominal: whether a limit holds for the nominal one of robust designs alone.
