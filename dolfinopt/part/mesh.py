@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
-from dolfinopt.mesh.solid_cells import Tetrahedra, filled_anew, msh_bytes, tetrahedra_of
+from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, tetrahedra_of
 from dolfinopt.part.domain import INBOARD, OUTBOARD, SolidDomain
 from dolfinopt.part.plane.curves import Arc, Curve, Line, Shape, Spline, curvature, direction
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
@@ -485,18 +485,6 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
         else:
             return mesh
     raise InputError(f"arm {part.name!r}: {reason}")
-
-
-def filled(part: SolidPart, mesh: Tetrahedra, size: float) -> Tetrahedra:
-    """Mesh a part anew within the boundary of a mesh of it, whose triangles stay.
-
-    Raises:
-        InputError: Gmsh cannot mesh it.
-    """
-    found = _of_volume(part, filled_anew(mesh, size))
-    if found.quality.min() <= LEAST:
-        raise InputError(f"arm {part.name!r}: its cells are flat")
-    return found
 
 
 def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:

@@ -13,12 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.part.merit import judge_step
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.sides import BrokenError
 from dolfinopt.part.problem import Place, Problem, State
@@ -36,6 +34,8 @@ DEAR, RESTORING = 50.0, 3  # price of limits that shall be met above all; steps 
 FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
 ENDS = 1.5  # of the way of a side's end, that a corner may go in a step
 HARDLY = 1e-5  # relative fall that a step must promise
+# Of the promised fall: what a step must bring, and what makes the next one shorter, or longer.
+ACCEPTED, POOR, GOOD = 0.05, 0.25, 0.6
 SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
 PATIENCE = 3  # times that no step betters the parts on a mesh, before the search ends
 
@@ -109,12 +109,7 @@ class Step:
     fall: float
 
 
-def sides_of(state: State) -> Mapping[int, FreeSides]:
-    """Return the forms of a state, all of which are sides."""
-    return cast(Mapping[int, FreeSides], state.outlines)
-
-
-class SidesSearch:
+class Search:
     """Steps within a trust region from one state on.
 
     Attributes:
@@ -201,7 +196,7 @@ class SidesSearch:
     def _simplified(self) -> bool:
         """Go on without sides that have vanished and holes that close, if that costs little."""
         before = self.state
-        for k, one in sides_of(before).items():
+        for k, one in before.outlines.items():
             simpler, count = one.simplified()
             if not count:
                 continue
@@ -251,11 +246,12 @@ class SidesSearch:
             if tried is None:
                 self.radius *= 0.5
                 continue
-            accepted, factor = judge_step(0.0, -tried.fall, -tried.promised)
-            if tried.promised < HARDLY * abs(state.values[0]) and not accepted:
+            share = tried.fall / tried.promised
+            if share < ACCEPTED and tried.promised < HARDLY * abs(state.values[0]):
                 return False
-            self.radius = min(LARGEST_RADIUS, factor * self.radius)
-            if accepted and tried.fall > 0.0:
+            if share < POOR or share > GOOD:
+                self.radius = min(LARGEST_RADIUS, self.radius * (0.5 if share < POOR else 2.0))
+            if share >= ACCEPTED:
                 self._take(state, tried, linear)
                 return True
         return False
@@ -296,7 +292,7 @@ class SidesSearch:
     def _linear(self, state: State, slopes: np.ndarray) -> Linear:
         """Return the limits that a step of this radius can meet."""
         reach, far, A, b, first = self.radius * FAR, [], [], [], 0
-        for one in sides_of(state).values():
+        for one in state.outlines.values():
             g, own = one.rows()
             near = g > -reach * one.cell * np.abs(own).sum(axis=1) - 0.1 * one.cell
             wide = np.zeros((int(near.sum()), slopes.shape[1]))
@@ -391,7 +387,7 @@ class SidesSearch:
         """Return the state after a step, the whole step, and whether its meshes are new."""
         first, after, whole = 0, dict[int, FreeSides](), []
         try:
-            for k, one in sides_of(state).items():
+            for k, one in state.outlines.items():
                 part = x[first : first + one.count]
                 first += one.count
                 near = one.moved(part).nearest()

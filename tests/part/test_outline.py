@@ -20,7 +20,7 @@ from dolfinopt.part.plane.curves import (
     direction,
     sampled,
 )
-from dolfinopt.part.plane.outline import draw_outline, search
+from dolfinopt.part.plane.outline import draw_outline
 from dolfinopt.part.plane.part import make_part
 
 pytestmark = pytest.mark.serial
@@ -183,22 +183,6 @@ def test_tapered_arm_with_a_boss_from_step(design, tmp_path):
     slopes = [np.subtract(*c.at(np.array([1.0, 0.0]))) for c in exact if isinstance(c, Line)]
     assert [abs(y / x) for x, y in slopes] == pytest.approx([0.01] * len(slopes), abs=1e-6)
     assert {round(c.radius, 8) for c in exact if isinstance(c, Arc)} >= {0.04, 0.02}
-
-
-@pytest.mark.parametrize(
-    ("size", "root", "most"),
-    [
-        (lambda x: x**3 - 0.2, 0.2 ** (1.0 / 3.0), 10),
-        (lambda x: np.exp(5.0 * x) - 2.0, np.log(2.0) / 5.0, 14),
-        (lambda x: -1.0 if x < 0.2 else 0.1 * (x - 0.5), 0.5, 14),  # nothing is left
-        (lambda x: 0.3 * x - (0.2 if x < 0.31 else -0.1), 0.31, 18),  # no root, a leap
-    ],
-)
-def test_search_finds_roots_and_leaps(size, root, most):
-    tried = []
-    found = search(lambda x: tried.append(x) or x, size, 0.0, 1.0, (-1.0, 1.0), 1e-4)
-    assert found == pytest.approx(root, abs=2e-3)
-    assert len(tried) <= most
 
 
 def test_checkerboard_is_refused_before_it_is_drawn(design, monkeypatch):

@@ -299,6 +299,25 @@ class Piece:
 
 
 @dataclass(frozen=True, eq=False)
+class Concave:
+    """A concave corner, whose radius is 0, or curve of an outline.
+
+    Attributes:
+        place: (2,) m.
+        radius: the least, m.
+        free: whether a curve that is not the arm's own is there.
+    """
+
+    place: np.ndarray
+    radius: float
+    free: bool
+
+    def __str__(self) -> str:
+        x, y = 1e3 * self.place
+        return f"({x:.1f}, {y:.1f}) mm: {1e3 * self.radius:.2g} mm"
+
+
+@dataclass(frozen=True, eq=False)
 class Shape:
     """The closed outline of a part.
 
@@ -332,23 +351,26 @@ class Shape:
         return sum(curve.area for curve in self.curves)
 
     @cached_property
-    def concave_radius(self) -> float:
-        """Smallest radius of concave places on free curves, m; infinity without any.
-
-        0 where they make a concave corner, with each other or with the arm's own.
-        """
-        least = np.inf
+    def concave(self) -> list[Concave]:
+        """Its concave corners, arcs and splines."""
+        found = []
         for loop in self.loops:
-            for before, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
+            for before, after in zip((loop[-1], *loop[:-1]), loop):
                 a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
-                if (before.free or after.free) and _cross(a, b) < -np.sin(KINK):
-                    return 0.0
+                if _cross(a, b) < -np.sin(KINK):
+                    found.append(Concave(after.curve.start, 0.0, before.free or after.free))
         for piece in self.pieces:
-            if piece.free:
-                t = np.linspace(0.0, 1.0, 33 if isinstance(piece.curve, Arc) else 2001)[1:-1]
-                bend = -curvature(piece.curve, t).min()
-                least = min(least, 1.0 / bend if bend > 0.0 else np.inf)
-        return float(least)
+            t = np.linspace(0.0, 1.0, 33)
+            bend = curvature(piece.curve, t)
+            if (least := bend.min()) < 0.0:
+                place = piece.curve.at(t)[bend.argmin()]
+                found.append(Concave(place, -1.0 / float(least), piece.free))
+        return found
+
+    @property
+    def concave_radius(self) -> float:
+        """Smallest radius of concave places beside free curves, m; infinity without any."""
+        return min((one.radius for one in self.concave if one.free), default=np.inf)
 
     def is_simple(self, tolerance: float) -> bool:
         """Return whether no curve crosses another one, as polygons within a distance see it."""

@@ -77,17 +77,6 @@ class FreeSides:
         """The part with these sides."""
         return self.plane if self.solid is None else plate_part(self.solid, self.plane)
 
-    made = current
-
-    @property
-    def size(self) -> float:
-        """Area, m2; of a plate in space volume, m3."""
-        return self.sides.shape.area * self._thickness
-
-    @property
-    def _thickness(self) -> float:
-        return 1.0 if self.solid is None else self.part.domain.thickness
-
     @property
     def _ties(self) -> np.ndarray:
         return self.sides.ties if self.repeated is None else self.repeated
@@ -141,17 +130,17 @@ class FreeSides:
         found = self.limits.nearest(self.sides, steps)
         return None if found is None else (replace(self, sides=found[0]), found[1])
 
-    def meshed(self, turns: np.ndarray | None = None) -> tuple[FreeSides, Mesh]:
-        """Return it with a new mesh; variables stay.
+    def meshed(self, turns: np.ndarray | None = None) -> Mesh:
+        """Return a new mesh of it.
 
         Args:
             turns: (n,) of its pieces along a side of the mesh, rad; None: `mesh.TURN`.
         """
         if self.solid is not None:
-            return self, self.current.mesh()
+            return self.current.mesh()
         if turns is None or len(turns) != len(self.sides.shape.pieces):
-            return self, self.plane.mesh(finer=())
-        return self, self.plane.mesh(finer=(), turn=turns)
+            return self.plane.mesh(finer=())
+        return self.plane.mesh(finer=(), turn=turns)
 
     def followed(self, mesh: Mesh) -> Mesh | None:
         """Return a mesh of sides nearby, moved to these; None where its triangles are spoilt."""
@@ -179,9 +168,9 @@ class FreeSides:
             found += one.pull(mesh.span[here, 0], g[:, here], len(here))
         return found @ self._ties
 
-    def size_by_x(self) -> np.ndarray:
-        """Return the derivative (count,) of the size by x."""
-        return self.sides.area_by_q() * self._thickness @ self._ties
+    def area_by_x(self) -> np.ndarray:
+        """Return the derivative (count,) of the area by x."""
+        return self.sides.area_by_q() @ self._ties
 
     def scaled(self, part: PlanePart, factors: np.ndarray) -> FreeSides:
         """Return the sides of a part that repeats this one's design, stretched by (2,) factors.

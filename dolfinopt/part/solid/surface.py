@@ -357,29 +357,6 @@ def distance_to_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(np.asarray(nearest) - points, axis=1))
 
 
-def nearest_facets(
-    points: np.ndarray, corners: np.ndarray, triangles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nearest triangle (n,) of points, and the shares (n, 3) of its corners there.
-
-    Args:
-        points: (n, 3) m.
-        corners: (k, 3) m.
-        triangles: (m, 3) of the corners.
-    """
-    import pyvista
-
-    found = pyvista.PolyData.from_regular_faces(corners, triangles)
-    which, nearest = found.find_closest_cell(points, return_closest_point=True)
-    a, b, c = corners[triangles[which]].swapaxes(0, 1)
-    normal = np.cross(b - a, c - a)
-    square = np.square(normal).sum(axis=1)
-    nearest = np.asarray(nearest)
-    second = (np.cross(nearest - a, c - a) * normal).sum(axis=1) / square
-    third = (np.cross(b - a, nearest - a) * normal).sum(axis=1) / square
-    return np.asarray(which), np.stack([1.0 - second - third, second, third], axis=1)
-
-
 def with_volume(surface: Surface, free: np.ndarray, volume: float) -> Surface:
     """Return a surface whose free points are moved along their normals until it has a volume.
 
