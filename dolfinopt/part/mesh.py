@@ -24,7 +24,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
 from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, tetrahedra_of
 from dolfinopt.part.domain import INBOARD, OUTBOARD, SolidDomain
-from dolfinopt.part.plane.curves import Arc, Curve, Line, Shape, Spline, curvature, direction
+from dolfinopt.part.plane.curves import Arc, Curve, Shape, Spline, curvature, direction
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
@@ -382,13 +382,12 @@ def _divided(
     """Return parameters of nodes along a curve, ends included, and sizes at all but the last."""
     step = np.linalg.norm(np.diff(curve.at(t), axis=0), axis=1)
     passed = np.append(0.0, np.cumsum(step * 0.5 * (1.0 / size[:-1] + 1.0 / size[1:])))
-    least = 1 if isinstance(curve, Line) else 2
+    count = int(np.ceil(passed[-1] - 0.2))
     if isinstance(curve, Arc):
-        least = max(least, int(np.ceil(abs(curve.sweep) / turn)))
         # Evenly: the area is exact then, see `outline_places`.
-        at = np.linspace(0.0, 1.0, max(int(np.ceil(passed[-1] - 0.2)), least) + 1)
+        at = np.linspace(0.0, 1.0, max(count, int(np.ceil(abs(curve.sweep) / turn)), 1) + 1)
     else:
-        count = max(int(np.ceil(passed[-1] - 0.2)), least)
+        count = max(count, 2 if isinstance(curve, Spline) else 1)
         at = np.interp(np.linspace(0.0, passed[-1], count + 1), passed, t)
     at[0], at[-1] = 0.0, 1.0
     return at, np.interp(at[:-1], t, size)

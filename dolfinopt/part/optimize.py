@@ -43,7 +43,7 @@ START = 1.2  # distance of the first sides from the densities' outline, cells
 SMALLEST = 3.0  # area of a hole that a search begins with, squared cells
 STUB = 1.5  # width of members that go where they end nowhere, cells
 START_STEPS = 40  # of Newton's to the first outline that keeps all limits
-TRIED, FEW = 3, 4  # struts that are left out in trial, the most promising; steps of each
+FEW = 4  # steps without the most promising strut, in trial
 MISSED, GAIN = 0.3, 5e-4  # of a missed limit in what a strut promises; relative, that it must bring
 LONG = 4.0  # work of a simulation without a strut, over that with it, at most
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
@@ -223,7 +223,9 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
     cell = flat.domain.cell
     outline = without_stubs(flat.outline, STUB * cell)
     hole = SMALLEST * max(cell, limits.tool) ** 2
-    sides = fitted_sides(outline, limits, START * cell, flat.sides.shape.area, hole)
+    sides = flat.sides
+    with suppress(InputError):  # where few do not keep the limits, the part's own will do
+        sides = fitted_sides(outline, limits, START * cell, sides.shape.area, hole)
     made = FreeSides(flat, sides, limits, solid)
     found = made.nearest(START_STEPS)
     return (made if found is None else found[0]).simplified(without_teeth)[0]
@@ -400,20 +402,20 @@ class Descent:
                     continue
                 missed = np.maximum(tried.values[1:], 0.0).max(initial=0.0)
                 promised.append((tried.values[0] + MISSED * abs(tried.values[0]) * missed, tried))
-        promised.sort(key=lambda one: one[0])
-        for _, tried in promised[:TRIED]:
-            search = Search(plain, tried)
-            search.run(min(FEW, self.iterations - self.done), lambda _: None, self.done)
-            self.done += search.steps
-            if search.best.rank[0] <= state.rank[0] and (
-                search.best.rank[1] < state.rank[1] - GAIN * abs(state.values[0])
-            ):
-                self.tell("better without a strut")
-                self.state = search.best
-                self._ran(Search(search.problem, search.best))
-                self.state = self._best_state()
-                return True
-        return False
+        if not promised:
+            return False
+        _, tried = min(promised, key=lambda one: one[0])
+        search = Search(plain, tried)
+        search.run(min(FEW, self.iterations - self.done), lambda _: None, self.done)
+        self.done += search.steps
+        best = search.best.rank
+        if best[0] > state.rank[0] or best[1] > state.rank[1] - GAIN * abs(state.values[0]):
+            return False
+        self.tell("better without a strut")
+        self.state = search.best
+        self._ran(Search(search.problem, search.best))
+        self.state = self._best_state()
+        return True
 
 
 def _restored(outlines: Outlines, forms: Forms) -> dict[int, FreeSides]:

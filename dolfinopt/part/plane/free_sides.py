@@ -33,7 +33,8 @@ from dolfinopt.part.solid.part import SolidPart, plate_part
 
 MOST = 40  # sides and holes that go at once, at most
 FAR_STEPS = 40  # of Newton's to an outline without a strut
-WORN = 0.12  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
+# Shape of a triangle, 1 where it is equilateral, below which a new mesh is due, and over the worst.
+WORN, WORSE = 0.12, 0.7
 Mesh = BodyMesh | Tetrahedra  # of a plate in space a `PlateMesh`
 Fewer = Callable[[Sides, Limits, int], Iterator[Sides]]
 
@@ -153,7 +154,8 @@ class FreeSides:
         if len(mesh.shape.pieces) != len(self.sides.shape.pieces):
             return None
         found = mesh.morphed(self.sides.shape)
-        return None if found.quality.min() < WORN else found
+        least = min(WORN, WORSE * mesh.quality.min())
+        return None if found.quality.min() < least else found
 
     def by_x(self, mesh: Mesh, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (m, count) by x from those (m, n, d) by the nodes of its mesh."""
