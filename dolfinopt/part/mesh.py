@@ -212,7 +212,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 TURN = 0.6  # of the outline along a side of a cell, rad, but where a finer one is asked for
 FINE = 0.2  # rad, there; halved for every further time
 PLATE_TURN = 0.9  # the same of plates in space, whose cells are as long as they are thick
-WALL = 1.0  # side of a cell over the width of the member
 LARGEST = 2.5  # side of a cell, cells of the design
 SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
@@ -253,21 +252,11 @@ def body_mesh(
             if not (fitted := mesh.fitted()).is_folded:
                 return fitted
         coarser *= 0.5  # a mesh of twice the sides is no finer than one of them
-    x, y = 1e3 * _nearest_sides(samples, shape)
+    x, y = 1e3 * outline.nearest
     raise InputError(
-        f"its outline cannot be meshed: curves nearly touch at ({x:.1f}, {y:.1f}) mm; choose "
+        f"its outline cannot be meshed: sides nearly touch at ({x:.1f}, {y:.1f}) mm; choose "
         "another --tool-radius or --tolerance"
     )
-
-
-def _nearest_sides(samples: Sequence[np.ndarray], shape: Shape) -> np.ndarray:
-    """Return a place (2,) on the outline where a member is narrowest, m."""
-    curves = shape.curves
-    points = np.vstack([c.at(t) for c, t in zip(curves, samples, strict=True)])
-    inward = -np.vstack([normals(c, t) for c, t in zip(curves, samples, strict=True)])
-    near = cKDTree(points).query(points, k=min(NEAREST, len(points)))[1]
-    both = [facing(points, sign * inward, near, 1.0) for sign in (1.0, -1.0)]
-    return np.asarray(points[np.argmin(np.minimum(*both))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,6 +276,12 @@ class _Outline:
         if min(len(loop) for loop in self.loops) < 3:
             return False
         return bool(shapely.is_valid(shapely.Polygon(self.loops[0], self.loops[1:])))
+
+    @property
+    def nearest(self) -> np.ndarray:
+        """The corner (2,) that is nearest to another one, m."""
+        points = np.vstack(self.loops)
+        return np.asarray(points[cKDTree(points).query(points, k=2)[0][:, 1].argmin()])
 
     @property
     def sides(self) -> np.ndarray:
@@ -342,7 +337,7 @@ def _sizes(
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     wall = facing(points, inward, near, 1.0)
     turn = np.repeat(turns, [len(t) for t in samples])
-    side = np.minimum(WALL * wall, LARGEST * cell)
+    side = np.minimum(wall, LARGEST * cell)  # one cell across a member
     for number, places in enumerate(finer):
         size = np.minimum(side, turn / bend)
         here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)

@@ -27,7 +27,6 @@ RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matter
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
 NEAR = -0.2  # of the stress of a place: from there on a finer mesh is asked
 ALLOWED = 0.05  # excess of a limit that a state may have for a better objective on the way
-LEAST_FINE, MOST_FINE = 0.9, 1.3  # stress of a place on a finer mesh over that on this one
 
 Place = tuple[int, int]  # number of an arm, and of a piece of its outline
 
@@ -221,10 +220,10 @@ class Problem:
             return plain, fresh
         finest = replace(plain, turns=_turns(fresh, 0.5 * FINE))
         fine = finest.evaluated(state.outlines, {}, fresh.solutions).places
-        places = {}
-        for key, value in fresh.places.items():
-            ratio = (1.0 + fine.get(key, value)) / (1.0 + value) if value > NEAR else 1.0
-            places[key] = (1.0 + value) * min(max(ratio, LEAST_FINE), MOST_FINE) - 1.0
+        places = {
+            key: fine.get(key, value) if value > NEAR else value
+            for key, value in fresh.places.items()
+        }
         local = {key: (1.0 + value) / fresh.means[key] for key, value in places.items()}
         return replace(plain, local=local), replace(fresh, places=places)
 

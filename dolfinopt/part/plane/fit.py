@@ -171,11 +171,9 @@ def _rings(outline: Outline) -> Iterator[np.ndarray]:
                 yield points
 
 
-def _runs(points: np.ndarray, lines: Sequence[Any], chord: float, tolerance: float) -> list[Run]:
+def _runs(points: np.ndarray, lines: Sequence[Any], chord: float) -> list[Run]:
     """Cut a closed polygon where it comes to another curve."""
     on = _owners(points, lines, 3.0 * chord)
-    on = _without_dents(points, on, lines, tolerance)
-    on = _without_specks(points, on, tolerance)
     return [
         Run(points[np.append(block, block[-1] + 1) % len(points)], int(on[block[0]]))
         for block in _blocks(on)
@@ -207,32 +205,6 @@ def _blocks(on: np.ndarray) -> list[np.ndarray]:
     return [np.arange(a, b) % len(on) for a, b in zip(starts, ends, strict=True)]
 
 
-def _without_dents(
-    points: np.ndarray, on: np.ndarray, lines: Sequence[Any], depth: float
-) -> np.ndarray:
-    """Give free blocks that hardly leave a curve between two blocks of it to that curve."""
-    import shapely
-
-    blocks = _blocks(on)
-    for k, block in enumerate(blocks):
-        before, after = on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]
-        if len(blocks) > 1 and on[block[0]] == -1 and before == after != -1:
-            if shapely.distance(shapely.points(points[block]), lines[before]).max() < depth:
-                on[block] = before
-    return on
-
-
-def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarray:
-    """Make blocks on curves that are shorter than `size` free where both neighbours are."""
-    step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
-    blocks = _blocks(on)
-    for k, block in enumerate(blocks):
-        before, after = on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]
-        if len(blocks) > 1 and before == after == -1 and step[block].sum() < size:
-            on[block] = -1
-    return on
-
-
 # -- loops of sides -------------------------------------------------------------------------------
 
 
@@ -259,7 +231,7 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
     circles: list[Circle] = []
     fixed: list[tuple[Piece, ...]] = []
     for ring in _rings(outline):
-        runs = _runs(ring, lines, outline.chord, tolerance)
+        runs = _runs(ring, lines, outline.chord)
         for chain, halved in _chains(runs, len(edges) if domain.symmetric else -2):
             if _hole_area(chain, halved) < hole:
                 continue

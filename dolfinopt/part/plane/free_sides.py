@@ -32,7 +32,6 @@ from dolfinopt.part.plane.simpler import simplifications, without_struts
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
 MOST = 40  # sides and holes that go at once, at most
-FAR_STEPS = 40  # of Newton's to an outline without a strut
 # Shape of a triangle, 1 where it is equilateral, below which a new mesh is due, and over the worst.
 WORN, WORSE = 0.12, 0.7
 Mesh = BodyMesh | Tetrahedra  # of a plate in space a `PlateMesh`
@@ -115,7 +114,7 @@ class FreeSides:
     def without_struts(self) -> Iterator[FreeSides]:
         """Yield it without one of its struts, the thinnest first."""
         for sides in without_struts(self.sides, self.limits, self.part.domain.outer_edges):
-            if (found := replace(self, sides=sides).nearest(FAR_STEPS)) is not None:
+            if (found := replace(self, sides=sides).nearest()) is not None:
                 yield found[0]
 
     def moved(self, x: np.ndarray) -> FreeSides:
@@ -126,9 +125,9 @@ class FreeSides:
         """
         return replace(self, sides=self.sides.moved(self.sides.ties @ x))
 
-    def nearest(self, steps: int = 12) -> tuple[FreeSides, np.ndarray] | None:
+    def nearest(self) -> tuple[FreeSides, np.ndarray] | None:
         """Return the nearest one that keeps the limits, and the step to it; None: there is none."""
-        found = self.limits.nearest(self.sides, steps)
+        found = self.limits.nearest(self.sides)
         return None if found is None else (replace(self, sides=found[0]), found[1])
 
     def meshed(self, turns: np.ndarray | None = None) -> Mesh:

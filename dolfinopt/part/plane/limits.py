@@ -164,18 +164,15 @@ class Limits:
 
     # -- the nearest outline that keeps them -------------------------------------------------------
 
-    def nearest(
-        self, sides: Sides, steps: int = STEPS, area: float | None = None
-    ) -> tuple[Sides, np.ndarray] | None:
+    def nearest(self, sides: Sides, area: float | None = None) -> tuple[Sides, np.ndarray] | None:
         """Return the nearest outline that keeps all limits, and the step x to it; None: none.
 
         Args:
             sides: where to begin.
-            steps: of Newton's, at most.
             area: that it shall have besides, m2.
         """
         whole = np.zeros(sides.count)
-        for _ in range(steps):
+        for _ in range(STEPS):
             try:
                 g, A = self.rows(sides)
                 margin = np.full(len(g), 0.3 * KEPT)

@@ -8,7 +8,7 @@ tool.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -23,11 +23,6 @@ if TYPE_CHECKING:
     from shapely import Geometry, Polygon
 
 
-NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
-SMALLEST_STUB, SPECK = (
-    0.25,
-    8.0,
-)  # area of a stub at least, and of its thicker end at most, squared widths
 QUADRANT = 12  # sides of a quarter of a disc
 SAGITTA = 0.02  # of the polygons in place of the tool's circle, tolerances
 SHALLOW = 0.1  # depth of corners that are left as they are, tolerances
@@ -201,11 +196,8 @@ STRIP = 0.5
 # corner are joined in the finite elements.
 LINK = 0.5
 UNIFORM = 1e-3  # range of a density without outline
+NECK = 3.0  # width of necks that are cut, tolerances: sides on both of them must not meet
 PINHOLE = 0.5  # diameter of holes that are closed whatever the tool, cells
-NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must not meet
-# Corners in which solid cells touch, over solid cells, from which on a design is a checkerboard:
-# one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.08.
-CHECKERED, FEW = 0.4, 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,12 +263,6 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
             f"--tool-radius = {tool_radius:g} m: the tool is as wide as {where}, which is "
             f"{domain.height:g} m high; expected less than {0.5 * domain.height:g} m"
         )
-    solid = int((domain.x_phys > 0.5).sum())
-    if domain.contacts > max(CHECKERED * solid, FEW):
-        raise InputError(
-            f"{where}: its {solid} solid cells touch each other in {domain.contacts} corners: a "
-            "checkerboard has no outline; give design.filter_radius the length of two cells or more"
-        )
     given = _given(domain, CHORD * tolerance)
     target = domain.volume
     if given.stays.area > target * (1.0 + AREA):
@@ -294,10 +280,9 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
             "optimise it first"
         )
 
-    for field in (domain.beside, domain.field):
-        found = _found(replace(domain, field=field), given, tool_radius, tolerance)
-        if _off(found) <= LEAP:
-            return replace(found, domain=domain)
+    found = _found(domain, given, tool_radius, tolerance)
+    if _off(found) <= LEAP:
+        return found
     raise InputError(
         f"{where}: the material of the design does not hang together: at no level has the "
         "piece that joins both interfaces the design's volume; let the optimisation go on "
@@ -394,42 +379,3 @@ def _at(
 def _off(outline: Outline) -> float:
     """Return by how much the area differs from the volume, relative."""
     return abs(outline.area / outline.domain.volume - 1.0)
-
-
-def without_stubs(outline: Outline, width: float) -> Outline:
-    """Return an outline without members narrower than `width`, m, that end nowhere.
-
-    A narrow piece stays where it joins two places of what is wider, or lies in what must stay.
-    """
-    import shapely
-
-    polygon, near = outline.polygon, NEAR_STUB * width
-    stays = _given(outline.domain, outline.chord).stays.intersection(polygon)
-    wide = polygon.buffer(-0.5 * width).buffer(0.5 * width, quad_segs=QUADRANT)
-    cores = polygons_of(wide)
-    narrow = polygons_of(polygon.difference(wide.buffer(near)))
-    members = [one.buffer(2.0 * near) for one in narrow if one.area > SMALLEST_STUB * width**2]
-    core = max(cores, key=lambda one: one.area, default=shapely.Polygon())
-    dropped: list[Geometry] = []
-    while True:
-        whole = shapely.union_all(cores)
-        loose = [
-            one
-            for one in members
-            if not one.interiors and len(polygons_of(one.intersection(whole))) == 1
-        ]
-        members = [one for one in members if one not in loose]
-        ends = shapely.union_all(members)
-        alone = [
-            one
-            for one in cores
-            if one is not core
-            and len(polygons_of(ends.intersection(one))) < 2
-            and one.area < width * SPECK * width
-        ]
-        cores = [one for one in cores if one not in alone]
-        if not loose and not alone:
-            break
-        dropped += [*loose, *alone]
-    left = polygon.difference(shapely.union_all(dropped)).union(stays)
-    return replace(outline, polygon=max(polygons_of(left), key=lambda one: one.area))

@@ -594,17 +594,8 @@ def _among(points: np.ndarray, some: np.ndarray) -> np.ndarray:
 
 def _regions(solid: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return which piece of a grid its points and its cells belong to."""
-    import scipy.sparse as sp
-    from scipy.sparse.csgraph import connected_components
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    first = vtk_to_numpy(solid.GetCells().GetOffsetsArray())
-    cells = np.repeat(np.arange(solid.n_cells), np.diff(first))
-    size = solid.n_cells + solid.n_points
-    ends = cells, solid.n_cells + solid.cell_connectivity
-    graph = sp.csr_matrix((np.ones(len(cells)), ends), shape=(size, size))
-    pieces = connected_components(graph, directed=False)[1]
-    return pieces[solid.n_cells :], pieces[: solid.n_cells]
+    found = solid.connectivity()
+    return np.asarray(found.point_data["RegionId"]), np.asarray(found.cell_data["RegionId"])
 
 
 def _number_of_pieces(solid: Any) -> int:
