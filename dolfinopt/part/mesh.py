@@ -24,7 +24,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
 from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, tetrahedra_of
 from dolfinopt.part.domain import INBOARD, OUTBOARD, SolidDomain
-from dolfinopt.part.plane.curves import Arc, Curve, Shape, Spline, curvature, direction
+from dolfinopt.part.plane.curves import Arc, Curve, Shape, Spline, curvature
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
@@ -197,12 +197,8 @@ def outline_places(mesh: BodyMesh) -> tuple[np.ndarray, np.ndarray]:
 
 def normals(curve: Curve, t: np.ndarray) -> np.ndarray:
     """Return the unit normals (n, 2) to the right, away from the material."""
-    d = np.array(curve.derivative(t))
-    size = np.linalg.norm(d, axis=1)
-    for k in np.flatnonzero(size == 0.0):  # splines whose first control points coincide
-        d[k], size[k] = direction(curve, float(t[k])), 1.0
-    d /= size[:, None]
-    return np.stack([d[:, 1], -d[:, 0]], axis=1)
+    d = curve.derivative(t)
+    return np.stack([d[:, 1], -d[:, 0]], axis=1) / np.linalg.norm(d, axis=1)[:, None]
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

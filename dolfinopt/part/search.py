@@ -132,7 +132,7 @@ class Search:
         # Without stress there is nothing that a finer mesh of the first state would tell.
         self.since, self.falls = FOLLOWED, list[float]()
         if not state.places:
-            self.since, self.falls = 0, [float(self.best.values[0])]
+            self.since, self.falls = 0, [self.best.rank[1]]
         self.steps, self.lost, self.spent = 0, 0, False
         self.radius, self.price = FIRST_RADIUS, PRICE
         self.H, self.way, self.reach = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
@@ -188,7 +188,7 @@ class Search:
         self.passed = [dict(self.state.outlines)]
         if not self.falls or self.state.rank <= self.best.rank:
             self.best = self.state.released
-        self.falls.append(self.best.values[0])
+        self.falls.append(self.best.rank[1])
         self._keep_met()
 
     def _keep_met(self) -> None:
@@ -217,7 +217,7 @@ class Search:
         return self.state is not before
 
     def _settled(self) -> bool:
-        if len(self.falls) < 3 or self.best.values[1:].max(initial=0.0) > 5.0 * EXCESS:
+        if len(self.falls) < 3 or self.best.rank[0] > 0.0:
             return False
         return bool(self.falls[-3] - self.falls[-1] < SETTLED * abs(self.falls[-1]))
 

@@ -157,32 +157,21 @@ class Spline:
         return self.points[-1]
 
     @property
+    def _whole(self) -> BSpline:
+        return BSpline.construct_fast(self.knots, self.points, DEGREE)
+
+    @property
     def breaks(self) -> np.ndarray:
         """Where its polynomials meet, ends included."""
         return np.unique(self.knots)
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return the points (n, 2) at parameters (n,), m."""
-        whole = BSpline.construct_fast(self.knots, self.points, DEGREE)
-        return whole(np.asarray(t, dtype=float))
+        return self._whole(np.asarray(t, dtype=float))
 
     def derivative(self, t: np.ndarray, order: int = 1) -> np.ndarray:
         """Return a derivative (n, 2) by t, m."""
-        knots = self.knots[order:-order]
-        slope = BSpline.construct_fast(knots, self.derived(order), DEGREE - order)
-        return slope(np.asarray(t, dtype=float))
-
-    def derived(self, order: int) -> np.ndarray:
-        """Return the control points (n - order, 2) of a derivative by t, m.
-
-        Its knots are the curve's without so many at each end.
-        """
-        knots, points = self.knots, self.points
-        for degree in range(DEGREE, DEGREE - order, -1):
-            width = knots[degree + 1 : -1] - knots[1 : -degree - 1]
-            points = degree * np.diff(points, axis=0) / width[:, None]
-            knots = knots[1:-1]
-        return points
+        return self._whole.derivative(order)(np.asarray(t, dtype=float))
 
     def parameters(self, tolerance: float) -> np.ndarray:
         """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
@@ -256,21 +245,13 @@ def curvature(curve: Curve, t: np.ndarray) -> np.ndarray:
     if isinstance(curve, Arc):
         return np.full(len(t), np.sign(curve.sweep) / curve.radius)
     d, dd = curve.derivative(t), curve.derivative(t, 2)
-    speed = np.maximum(np.linalg.norm(d, axis=1), np.finfo(float).tiny)
-    return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3
+    return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3
 
 
 def direction(curve: Curve, t: float) -> np.ndarray:
     """Return the unit tangent (2,) at a parameter."""
     d = curve.derivative(np.array([t]))[0]
-    size = np.linalg.norm(d)
-    if size == 0.0:  # a spline whose first control points coincide
-        d = (
-            curve.at(np.array([min(t + 1e-3, 1.0)]))[0]
-            - curve.at(np.array([max(t - 1e-3, 0.0)]))[0]
-        )
-        size = np.linalg.norm(d)
-    return d / size
+    return np.asarray(d / np.linalg.norm(d))
 
 
 def _inside(ends: np.ndarray) -> np.ndarray:

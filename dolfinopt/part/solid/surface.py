@@ -10,10 +10,12 @@ surface smoothing as filter design, ECCV 1996, doi:10.1007/BFb0015544.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
@@ -502,7 +504,7 @@ def _passes(start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarr
     return np.asarray(inside & ~flat)
 
 
-HALVINGS, NEAR = 30, 1e-3  # of the interval of levels; relative difference of volumes that will do
+FINE, NEAR = 1e-6, 1e-3  # of the level; relative difference of volumes that will do
 WHOLE = 1.0 - 1e-9  # of a mark that points between two marked nodes have, but for rounding
 FEW = (
     20_000  # cells up to which they are halved for the isosurface; of finer ones nodes tell enough
@@ -552,33 +554,24 @@ def _field(domain: SolidDomain) -> _Field:
 def at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:
     """Return the level that keeps the volume, the grid above it that joins both interfaces, the
     number of pieces that do not, and their volume, m3."""
-    field, target = _field(domain), domain.volume
-    best: tuple[float, float, Any, Any] | None = None
-    # Levels that enclose too much and too little, and by how much; halves where it stays the same.
-    low, high = 0.0, BELOW * float(field.values.max())
-    more, less, last = float(domain.sizes.sum()) - target, -target, 0.0
-    for _ in range(HALVINGS):
-        level = high - (high - low) * min(max(less / (less - more), 0.1), 0.9)
+    field, target, tried = _field(domain), domain.volume, list[tuple[float, float, Any, Any]]()
+
+    def excess(level: float) -> float:
         whole = field.above(level)
         joined = _joined(whole)
         off = (0.0 if joined is None else outside(joined)[0].volume) - target
-        if joined is not None and (best is None or abs(off) < best[0]):
-            best = abs(off), level, whole, joined
-        if abs(off) <= NEAR * target:
-            break
-        if off > 0.0:
-            low, more = level, off
-            less *= 0.5 if last > 0.0 else 1.0
-        else:
-            high, less = level, off
-            more *= 0.5 if last < 0.0 else 1.0
-        last = off
-    if best is None:
+        if joined is not None:
+            tried.append((abs(off), level, whole, joined))
+        return 0.0 if abs(off) <= NEAR * target else off
+
+    with suppress(ValueError):  # whatever the level the volume is too large, or too small
+        brentq(excess, APART, BELOW * float(field.values.max()), xtol=FINE)
+    if not tried:
         raise InputError(
             f"arm {domain.name!r}: its design does not hang together: no material joins both "
             "interfaces; optimise longer, or with a larger design.volume_fraction"
         )
-    _, level, whole, joined = best
+    _, level, whole, joined = min(tried, key=lambda one: one[0])
     count = _number_of_pieces(whole) - _number_of_pieces(joined)
     lost = outside(whole)[0].volume - outside(joined)[0].volume if count else 0.0
     return level, joined, count, lost
