@@ -8,7 +8,7 @@ tool.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from shapely import Geometry, Polygon
 
 
+NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
+SMALLEST_STUB, SPECK = (
+    0.25,
+    8.0,
+)  # area of a stub at least, and of its thicker end at most, squared widths
 QUADRANT = 12  # sides of a quarter of a disc
 SAGITTA = 0.02  # of the polygons in place of the tool's circle, tolerances
 SHALLOW = 0.1  # depth of corners that are left as they are, tolerances
@@ -379,3 +384,42 @@ def _at(
 def _off(outline: Outline) -> float:
     """Return by how much the area differs from the volume, relative."""
     return abs(outline.area / outline.domain.volume - 1.0)
+
+
+def without_stubs(outline: Outline, width: float) -> Outline:
+    """Return an outline without members narrower than `width`, m, that end nowhere.
+
+    A narrow piece stays where it joins two places of what is wider, or lies in what must stay.
+    """
+    import shapely
+
+    polygon, near = outline.polygon, NEAR_STUB * width
+    stays = _given(outline.domain, outline.chord).stays.intersection(polygon)
+    wide = polygon.buffer(-0.5 * width).buffer(0.5 * width, quad_segs=QUADRANT)
+    cores = polygons_of(wide)
+    narrow = polygons_of(polygon.difference(wide.buffer(near)))
+    members = [one.buffer(2.0 * near) for one in narrow if one.area > SMALLEST_STUB * width**2]
+    core = max(cores, key=lambda one: one.area, default=shapely.Polygon())
+    dropped: list[Geometry] = []
+    while True:
+        whole = shapely.union_all(cores)
+        loose = [
+            one
+            for one in members
+            if not one.interiors and len(polygons_of(one.intersection(whole))) == 1
+        ]
+        members = [one for one in members if one not in loose]
+        ends = shapely.union_all(members)
+        alone = [
+            one
+            for one in cores
+            if one is not core
+            and len(polygons_of(ends.intersection(one))) < 2
+            and one.area < width * SPECK * width
+        ]
+        cores = [one for one in cores if one not in alone]
+        if not loose and not alone:
+            break
+        dropped += [*loose, *alone]
+    left = polygon.difference(shapely.union_all(dropped)).union(stays)
+    return replace(outline, polygon=max(polygons_of(left), key=lambda one: one.area))
