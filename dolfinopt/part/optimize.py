@@ -40,7 +40,7 @@ from dolfinopt.scene.load import Scene
 ITERATIONS = 80  # default, at most, from every start
 REPAIRS = 2  # times that limits missed in the end are met by further steps
 START = 1.2  # distance of the first sides from the densities' outline, cells
-# Width of members that go where they end nowhere, cells; with them the rod misses its stress by 45 %.
+# Width of members that go where they end nowhere, cells: else the rod misses its stress by 45 %.
 STUB = 1.5
 SMALLEST = 3.0  # area of a hole that a search begins with, squared cells
 FEW = 4  # steps without the most promising strut, in trial
