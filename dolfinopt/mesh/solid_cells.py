@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -301,37 +301,6 @@ def tetrahedra_of(
         InputError: Gmsh cannot mesh it; says why.
     """
     return in_child(_with_gmsh, _meshed, points, triangles, size, interfaces, edge)
-
-
-def filled_anew(mesh: Tetrahedra, size: float) -> Tetrahedra:
-    """Return tetrahedra within the boundary of a mesh, whose triangles stay.
-
-    Args:
-        mesh: whose cells may be bad; its boundary does not cross itself.
-        size: of the cells inside, m.
-
-    Raises:
-        InputError: Gmsh cannot mesh it; says why.
-    """
-    return in_child(_with_gmsh, _filled_anew, mesh, size)
-
-
-def _filled_anew(gmsh: Any, mesh: Tetrahedra, size: float) -> Tetrahedra:
-    facets = mesh.boundary
-    rim = np.unique(facets)
-    number = np.full(len(mesh.points), -1)
-    number[rim] = np.arange(len(rim))
-    _add_surface(gmsh, mesh.points[rim], number[facets])
-    solid = _generated(gmsh, [1], size)
-    found = _cells(gmsh, solid, {group: [] for group in ENDS})
-    if found.volumes.min() <= 0.0 or not np.array_equal(found.points[: len(rim)], mesh.points[rim]):
-        raise InputError("its cells do not fill it")
-    return replace(
-        found,
-        inboard=number[mesh.inboard],
-        outboard=number[mesh.outboard],
-        further={name: number[own] for name, own in mesh.further.items()},
-    )
 
 
 def _with_gmsh(work: Callable[..., Tetrahedra], *given: Any) -> Tetrahedra:

@@ -24,14 +24,18 @@ class LeastBuckling:
         factor: of the loads; infinite where nothing buckles below `LARGEST_FACTOR`.
         place: of the arm in the chain.
         instant: s.
+        motion: number of the scenario.
     """
 
     factor: float
     place: int
     instant: float
+    motion: int = 0
 
 
-def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuckling | None:
+def lowest_buckling(
+    arms: Mapping[int, Arm], trajectory: Trajectory, known: LeastBuckling | None = None
+) -> LeastBuckling | None:
     """Return the lowest factor of all arms at their worst instants, on this rank alone.
 
     None where nothing loads them.
@@ -39,18 +43,25 @@ def lowest_buckling(arms: Mapping[int, Arm], trajectory: Trajectory) -> LeastBuc
     Args:
         arms: of solid material, reduced.
         trajectory: of these arms; of scenarios the worst counts.
+        known: on other meshes: its arm is looked at, at its instant alone.
     """
     scene, motions = next(iter(arms.values())).scene, motions_of(trajectory)
     found = []
     for k, loads in arm_loads(scene, motions).items():
+        if known is not None:
+            here = known.place, known.motion
+            n = int(np.argmin(np.abs(motions[known.motion].t - known.instant)))
+            loads = [one.at(np.array([n])) for one in loads if (one.place, one.motion) == here]
+        if not loads:
+            continue
         # All motions one after the other: what is worst along one tells of the others, too.
         whole = np.concatenate([one.coefficients / one.stiffer for one in loads])
-        of, first = np.repeat(range(len(loads)), [len(one.instants) for one in loads]), loads[0]
-        every = replace(first, coefficients=whole, stiffer=1.0, instants=np.arange(len(whole)))
+        of = np.repeat(range(len(loads)), [len(one.instants) for one in loads])
+        every = replace(loads[0], coefficients=whole, stiffer=1.0, instants=np.arange(len(whole)))
         for each in pressed(arms[k].current, every):
             one = loads[of[each.instant]]
-            own = each.instant - int(np.argmax(of == of[each.instant]))
-            mu, t = float(each.modes.inverse[0]), motions[one.motion].t[own]
+            n = one.instants[each.instant - int(np.argmax(of == of[each.instant]))]
+            mu, t = float(each.modes.inverse[0]), float(motions[one.motion].t[n])
             factor = 1.0 / mu if mu * LARGEST_FACTOR > 1.0 else float("inf")
-            found.append(LeastBuckling(factor, one.place, float(t)))
+            found.append(LeastBuckling(factor, one.place, t, one.motion))
     return min(found, key=lambda one: one.factor, default=None)

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.output.design import ArmView, gather_views
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
 
 STRESS = "stress"
 BUCKLING = "buckling"
-PATIENCE = 20.0  # work of the crisp design's simulation before it is given up, over the densities'
+WEAK = 0.8  # frequency of a crisp arm over the densities', below which it is another design
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ class Column:
         stressed: name of the arm that has it.
         limits: the scene's constraints, without that of the volume, which all forms share.
         trajectory: its motion.
-        buckling: of plane parts on their last mesh; None of other forms.
+        buckling: of plane parts; None of other forms.
     """
 
     values: Mapping[str, float]
@@ -155,24 +154,24 @@ def _simulated(
 def design_columns(scene: Scene, folder: Path) -> tuple[Column, Column | None]:
     """Return the columns of the densities and of the crisp design.
 
-    None of hollow arms, and of a crisp design whose solid cells do not join the interfaces, or
-    that is so weak that its simulation takes `PATIENCE` times the work of the densities'.
+    None of hollow arms, and of a crisp design that falls apart or nearly so: its solid cells do
+    not join the interfaces, or an arm is `WEAK`.
     """
     from dolfinopt.output.design import read_design
 
     partition, arms = _built(scene)
     x_phys = read_design(folder / "design.npz", partition, arms)
-    with counted() as work:
-        density = _design_column(_simulated(scene, partition, arms, x_phys))
+    density = _design_column(_simulated(scene, partition, arms, x_phys))
     if scene.has_walls:  # to cut them at a thickness would make no sense
         return density, None
-    cut = {k: crisp(x, arms[k].mesh.area) for k, x in x_phys.items()}
-    if not all(arms[k].substructure.joins(x > 0.0) for k, x in cut.items()):
-        return density, None
+    for k, arm in arms.items():
+        cut, before = crisp(x_phys[k], arm.mesh.area), arm.state(x_phys[k]).first_frequency
+        if not arm.substructure.joins(cut > 0.0) or arm.state(cut).first_frequency < WEAK * before:
+            return density, None
+        x_phys[k] = cut
     try:
-        with counted(PATIENCE * work.done):
-            return density, _design_column(_simulated(scene, partition, arms, cut))
-    except ConvergenceError:  # what is left hangs together by next to nothing
+        return density, _design_column(_simulated(scene, partition, arms, x_phys))
+    except ConvergenceError:
         return density, None
 
 
@@ -210,11 +209,13 @@ def part_column(
     return column_of(one, peak, arm), found
 
 
-def _with_buckling(one: Simulated, column: Column) -> Column:
+def _with_buckling(one: Simulated, larger: Simulated | None, column: Column) -> Column:
     """Return the figures of plates with the lowest buckling factor."""
     if BUCKLING not in column.values:
         return column
-    found = lowest_buckling(one.arms, one.trajectory)
+    # Larger cells tell which arm buckles first, and when.
+    known = None if larger is None else lowest_buckling(larger.arms, larger.trajectory)
+    found = lowest_buckling(one.arms, one.trajectory, known)
     factor = float("nan") if found is None else found.factor
     return replace(column, values={**column.values, BUCKLING: factor}, buckling=found)
 
@@ -232,7 +233,7 @@ def column_of(one: Simulated, peak: Peak | None, arm: str) -> Column:
             for limit in limits
         ]
     values = dict(_values(one, float("nan") if peak is None else peak.value))
-    if not any(arm.is_solid for arm in one.scene.arms):  # it is looked at on the last mesh alone
+    if not any(arm.is_solid for arm in one.scene.arms):  # one mesh is enough
         values[BUCKLING] = float("nan")
     return Column(values, one.evaluation.objective, peak, arm, tuple(limits), one.trajectory)
 
@@ -480,8 +481,8 @@ class Check:
             )
         if self.crisp is None and not self.density.trajectory.scene.has_walls:
             found.append(
-                "the design cut at the density that keeps the volume falls apart or nearly so: it "
-                "is left out of the table"
+                "the design cut at the density that keeps the volume falls apart, or is far less "
+                "stiff: it is left out of the table"
             )
         found += [
             f"the part misses a limit: {one.sentence}" for one in self.part.limits if not one.met
@@ -619,12 +620,13 @@ def check_parts(
     else:
         density, crisp = known.density, known.crisp
     say("the machine with the parts, larger cells")
-    coarse = None
+    coarse = larger = None
     if meshes.coarse:
-        coarse, _ = part_column(scene, simulate_parts(scene, parts, meshes.coarse), parts)
+        larger = simulate_parts(scene, parts, meshes.coarse)
+        coarse, _ = part_column(scene, larger, parts)
     say("the machine with the parts")
     fine, column, stress, change, bodies = refined(scene, parts, meshes.fine, coarse)
-    column = _with_buckling(fine, column)
+    column = _with_buckling(fine, larger, column)
     cells = {place: one.cells for place, one in stress.items()}
     worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value

@@ -448,12 +448,11 @@ class Domain(Filled):
         area: (n_cells,) m2.
         x_phys: (n_cells,) physical densities.
         field: (n_cells,) what is smooth from cell to cell and falls where x_phys does: the
-            filtered densities before they are projected, or x_phys itself.
-        beside: (n_cells,) `field`, in cells that stay solid or void that of the nearest other one.
+            filtered densities before they are projected, or x_phys itself; in cells that stay solid
+            or void that of the nearest other one.
         crisp: whether `field` is a projected design, which leaps from cell to cell.
         links: (n, 2, 2) m, lines between the centroids of solid cells of a projected design that
             share a corner at least, where one of them is in a member no wider than a cell.
-        contacts: number of corners in which two solid cells touch that share nothing else.
         rim, rim_cells: (n, 2, 2) m, the sides of cells on the arm's outline, counterclockwise
             around the cell; (n,) which cell.
         outline: the arm's own, bores included.
@@ -470,10 +469,8 @@ class Domain(Filled):
     area: np.ndarray
     x_phys: np.ndarray
     field: np.ndarray
-    beside: np.ndarray
     crisp: bool
     links: np.ndarray
-    contacts: int
     rim: np.ndarray
     rim_cells: np.ndarray
     outline: Region
@@ -542,11 +539,9 @@ def domain_of(
         centroid=mesh.centroid,
         area=mesh.area,
         x_phys=x_phys,
-        field=x_phys if field is None else field,
-        beside=_without_kept(mesh, mesh.fixed, x_phys if field is None else field),
+        field=_without_kept(mesh, mesh.fixed, x_phys if field is None else field),
         crisp=field is None and bool(scene.design.projection),
         links=_links(cells.nodes, mesh.centroid, x_phys, bool(scene.design.projection)),
-        contacts=_contacts(cells.nodes, x_phys > 0.5),
         rim=rim,
         rim_cells=rim_cells,
         outline=outline,
@@ -558,21 +553,6 @@ def domain_of(
         symmetric=like.symmetric_about[0],
         minimum_member=scene.part.minimum_member or scene.design.minimum_member,
     )
-
-
-def _contacts(nodes: np.ndarray, solid: np.ndarray) -> int:
-    """Return how many nodes are all that two solid cells beside void share."""
-    import scipy.sparse as sp
-
-    chosen = nodes[solid]
-    cells = np.repeat(np.arange(len(chosen)), chosen.shape[1])
-    touch = sp.csc_matrix((np.ones(chosen.size), (cells, chosen.ravel())))
-    pairs = touch[:, np.diff(touch.indptr) == 2].indices.reshape(-1, 2)
-    if not len(pairs):
-        return 0
-    rows = touch.tocsr()
-    shared = rows[pairs[:, 0]].multiply(rows[pairs[:, 1]]).sum(axis=1)
-    return int((np.asarray(shared) == 1.0).sum())
 
 
 def _links(

@@ -22,9 +22,9 @@ from scipy.spatial import cKDTree
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
-from dolfinopt.mesh.solid_cells import Tetrahedra, filled_anew, msh_bytes, tetrahedra_of
+from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, tetrahedra_of
 from dolfinopt.part.domain import INBOARD, OUTBOARD, SolidDomain
-from dolfinopt.part.plane.curves import Arc, Curve, Line, Shape, Spline, curvature, direction
+from dolfinopt.part.plane.curves import Arc, Curve, Shape, Spline, curvature
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
@@ -197,12 +197,8 @@ def outline_places(mesh: BodyMesh) -> tuple[np.ndarray, np.ndarray]:
 
 def normals(curve: Curve, t: np.ndarray) -> np.ndarray:
     """Return the unit normals (n, 2) to the right, away from the material."""
-    d = np.array(curve.derivative(t))
-    size = np.linalg.norm(d, axis=1)
-    for k in np.flatnonzero(size == 0.0):  # splines whose first control points coincide
-        d[k], size[k] = direction(curve, float(t[k])), 1.0
-    d /= size[:, None]
-    return np.stack([d[:, 1], -d[:, 0]], axis=1)
+    d = curve.derivative(t)
+    return np.stack([d[:, 1], -d[:, 0]], axis=1) / np.linalg.norm(d, axis=1)[:, None]
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -212,7 +208,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 TURN = 0.6  # of the outline along a side of a cell, rad, but where a finer one is asked for
 FINE = 0.2  # rad, there; halved for every further time
 PLATE_TURN = 0.9  # the same of plates in space, whose cells are as long as they are thick
-WALL = 1.0  # side of a cell over the width of the member
 LARGEST = 2.5  # side of a cell, cells of the design
 SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
@@ -253,21 +248,11 @@ def body_mesh(
             if not (fitted := mesh.fitted()).is_folded:
                 return fitted
         coarser *= 0.5  # a mesh of twice the sides is no finer than one of them
-    x, y = 1e3 * _nearest_sides(samples, shape)
+    x, y = 1e3 * outline.nearest
     raise InputError(
-        f"its outline cannot be meshed: curves nearly touch at ({x:.1f}, {y:.1f}) mm; choose "
+        f"its outline cannot be meshed: sides nearly touch at ({x:.1f}, {y:.1f}) mm; choose "
         "another --tool-radius or --tolerance"
     )
-
-
-def _nearest_sides(samples: Sequence[np.ndarray], shape: Shape) -> np.ndarray:
-    """Return a place (2,) on the outline where a member is narrowest, m."""
-    curves = shape.curves
-    points = np.vstack([c.at(t) for c, t in zip(curves, samples, strict=True)])
-    inward = -np.vstack([normals(c, t) for c, t in zip(curves, samples, strict=True)])
-    near = cKDTree(points).query(points, k=min(NEAREST, len(points)))[1]
-    both = [facing(points, sign * inward, near, 1.0) for sign in (1.0, -1.0)]
-    return np.asarray(points[np.argmin(np.minimum(*both))])
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,6 +272,12 @@ class _Outline:
         if min(len(loop) for loop in self.loops) < 3:
             return False
         return bool(shapely.is_valid(shapely.Polygon(self.loops[0], self.loops[1:])))
+
+    @property
+    def nearest(self) -> np.ndarray:
+        """The corner (2,) that is nearest to another one, m."""
+        points = np.vstack(self.loops)
+        return np.asarray(points[cKDTree(points).query(points, k=2)[0][:, 1].argmin()])
 
     @property
     def sides(self) -> np.ndarray:
@@ -342,7 +333,7 @@ def _sizes(
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     wall = facing(points, inward, near, 1.0)
     turn = np.repeat(turns, [len(t) for t in samples])
-    side = np.minimum(WALL * wall, LARGEST * cell)
+    side = np.minimum(wall, LARGEST * cell)  # one cell across a member
     for number, places in enumerate(finer):
         size = np.minimum(side, turn / bend)
         here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)
@@ -382,13 +373,12 @@ def _divided(
     """Return parameters of nodes along a curve, ends included, and sizes at all but the last."""
     step = np.linalg.norm(np.diff(curve.at(t), axis=0), axis=1)
     passed = np.append(0.0, np.cumsum(step * 0.5 * (1.0 / size[:-1] + 1.0 / size[1:])))
-    least = 1 if isinstance(curve, Line) else 2
+    count = int(np.ceil(passed[-1] - 0.2))
     if isinstance(curve, Arc):
-        least = max(least, int(np.ceil(abs(curve.sweep) / turn)))
         # Evenly: the area is exact then, see `outline_places`.
-        at = np.linspace(0.0, 1.0, max(int(np.ceil(passed[-1] - 0.2)), least) + 1)
+        at = np.linspace(0.0, 1.0, max(count, int(np.ceil(abs(curve.sweep) / turn)), 1) + 1)
     else:
-        count = max(int(np.ceil(passed[-1] - 0.2)), least)
+        count = max(count, 2 if isinstance(curve, Spline) else 1)
         at = np.interp(np.linspace(0.0, passed[-1], count + 1), passed, t)
     at[0], at[-1] = 0.0, 1.0
     return at, np.interp(at[:-1], t, size)
@@ -485,18 +475,6 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
         else:
             return mesh
     raise InputError(f"arm {part.name!r}: {reason}")
-
-
-def filled(part: SolidPart, mesh: Tetrahedra, size: float) -> Tetrahedra:
-    """Mesh a part anew within the boundary of a mesh of it, whose triangles stay.
-
-    Raises:
-        InputError: Gmsh cannot mesh it.
-    """
-    found = _of_volume(part, filled_anew(mesh, size))
-    if found.quality.min() <= LEAST:
-        raise InputError(f"arm {part.name!r}: its cells are flat")
-    return found
 
 
 def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:

@@ -1,9 +1,9 @@
 """Shape optimisation of the parts: the scene's objective within its limits, on their own mesh.
 
-Variables are the sides, fillets and circles of plates (`plane.free_sides`), or the moves of the
-nodes of surfaces; the machine is that of the parts on meshes along them, and gradients are those by
-the places of the nodes (`responses.products`). What a search found is judged on a finer mesh;
-limits that are not kept there are tightened by what is missing, and the iterations go on.
+Variables are the sides, fillets and circles of plates (`plane.free_sides`); the machine is that of
+the parts on meshes along them, and gradients are those by the places of the nodes
+(`responses.products`). What a search found is judged on a finer mesh; limits that are not kept
+there are tightened by what is missing, and a few more steps meet them.
 Source: Allaire, Jouve & Toader (2004), doi:10.1016/j.jcp.2003.09.032.
 """
 
@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import ceil
 from typing import Any, cast
 
 import numpy as np
@@ -23,34 +23,32 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import Column, refined
 from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, mesh_parts
-from dolfinopt.part.plane.fit import rough_sides
+from dolfinopt.part.plane.fit import fitted_sides
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.outline import without_stubs
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.simpler import without_teeth
-from dolfinopt.part.problem import RESERVE, FreeForm, Problem, State
-from dolfinopt.part.search import SidesSearch
-from dolfinopt.part.solid.free_surface import free_surface
+from dolfinopt.part.problem import RESERVE, Problem, State
+from dolfinopt.part.search import Search
 from dolfinopt.part.solid.part import SolidPart
-from dolfinopt.part.solid.search import SurfaceSearch
 from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 
 ITERATIONS = 80  # default, at most, from every start
-FIRST = 0.75  # of them, before a finer mesh has judged
 REPAIRS = 2  # times that limits missed in the end are met by further steps
-ROUNDS = 6  # of iterations, each with limits tightened by what the finer mesh showed
 START = 1.2  # distance of the first sides from the densities' outline, cells
-STUB = 1.5  # width of members that go where they end nowhere, cells
-START_STEPS = 40  # of Newton's to the first outline that keeps all limits
-TRIED, FEW = 3, 4  # struts that are left out in trial, the most promising; steps of each
+# Width of members that go where they end nowhere, cells: else the rod misses its stress by 45 %.
+STUB = 1.5
+SMALLEST = 3.0  # area of a hole that a search begins with, squared cells
+FEW = 4  # steps without the most promising strut, in trial
 MISSED, GAIN = 0.3, 5e-4  # of a missed limit in what a strut promises; relative, that it must bring
 LONG = 4.0  # work of a simulation without a strut, over that with it, at most
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 
+Outlines = Mapping[int, FreeSides]
 Tell = Callable[[str], None]
 Keep = Callable[[Sequence[Saved]], None]
 
@@ -189,8 +187,7 @@ def optimize_parts(
                 outlines = {k: _free(scene, k, part) for k, part in trusses.items()}
             if starts:
                 tell(f"from {name}")
-            plane = all(isinstance(one, FreeSides) for one in outlines.values())
-            begun = Problem(scene, parts, {}, by_places=plane), outlines, iterations, tell
+            begun = Problem(scene, parts, {}), outlines, iterations, tell
             descent = Descent(*begun, number, kept, saved.get(number))
             found.append(descent.found(name))
         except (ConvergenceError, InputError) as error:  # the parts as they were remain
@@ -207,32 +204,31 @@ def optimize_parts(
     return Optimized(best, others, mesh_parts(best.parts), given.value, interrupted)
 
 
-def _free(scene: Scene, k: int, part: Part) -> FreeForm:
-    """Return what moves of a part; it is no thinner where other arms repeat it smaller."""
+def _free(scene: Scene, k: int, part: Part) -> FreeSides:
+    """Return the sides of a part; no thinner than arms that repeat it smaller allow."""
     repeating = [scene.arms[j] for j, pattern in scene.patterns.items() if pattern == k]
     one = scene.arms[k]
     sizes = [s for a in repeating for s in (a.length / one.length, a.height / one.height)]
     flat = part.flat if isinstance(part, SolidPart) else part
-    if isinstance(flat, PlanePart):
-        limits = limits_of_part(
-            flat.domain, flat.outline.tool_radius, scene.design.minimum_gap, min([1.0, *sizes])
-        )
-        solid = part.domain if isinstance(part, SolidPart) else None
-        cell = flat.domain.cell
-        outline = without_stubs(flat.outline, STUB * cell)
-        rough = rough_sides(outline, limits, START * cell, flat.sides.shape.area)
-        sides = flat.sides
-        if rough is not None and rough.count < sides.count:
-            sides = rough
-        made = FreeSides(flat, sides, limits, solid)
-        found = made.nearest(START_STEPS)
-        return (made if found is None else found[0]).simplified(without_teeth)[0]
-    if not isinstance(part, SolidPart):
+    if not isinstance(flat, PlanePart):
         raise InputError(
-            f"--optimize: the wall of arm {part.name!r} is what dolfinopt optimize has moved "
-            "already (arms.hollow); leave it out"
+            f"--optimize: the surface of arm {part.name!r} has no sides that could move: its part "
+            "is what dolfinopt optimize has made of it; leave --optimize out, or make a plate of "
+            "it (arms.extruded = true)"
         )
-    return free_surface(part, part.mesh())
+    limits = limits_of_part(
+        flat.domain, flat.outline.tool_radius, scene.design.minimum_gap, min([1.0, *sizes])
+    )
+    solid = part.domain if isinstance(part, SolidPart) else None
+    cell = flat.domain.cell
+    hole = SMALLEST * max(cell, limits.tool) ** 2
+    outline = without_stubs(flat.outline, STUB * cell)
+    sides = flat.sides
+    with suppress(InputError):  # where few do not keep the limits, the part's own will do
+        sides = fitted_sides(outline, limits, START * cell, sides.shape.area, hole)
+    made = FreeSides(flat, sides, limits, solid)
+    found = made.nearest()
+    return (made if found is None else found[0]).simplified(without_teeth)[0]
 
 
 def _rank(scene: Scene, value: float, limits: tuple[Limit, ...]) -> tuple[float, float]:
@@ -272,7 +268,7 @@ class Descent:
     def __init__(
         self,
         problem: Problem,
-        outlines: Mapping[int, FreeForm],
+        outlines: Outlines,
         iterations: int,
         tell: Tell,
         number: int = 0,
@@ -282,7 +278,7 @@ class Descent:
         """Begin at outlines, or where a search from them is known to have been."""
         self.iterations, self.tell, self.number, self.keep = iterations, tell, number, keep
         self.known, self.done = known, 0
-        self.best, self.forms = cast(Found | None, None), cast(Mapping[int, FreeForm], {})
+        self.best, self.forms = cast(Found | None, None), cast(Outlines, {})
         if known is not None:
             problem = replace(problem, tightened=known.tightened)
             outlines, self.forms = _restored(outlines, known.forms), _restored(outlines, known.best)
@@ -290,7 +286,7 @@ class Descent:
         self.state = problem.evaluated(outlines, {})
         decided = stiffening_of(self.state.simulated.arms)
         self.problem = replace(problem, stiffening=decided.on if decided else None)
-        self.search = self._begun(self.state)
+        self.search = Search(self.problem, self.state)
 
     def found(self, start: str) -> Found:
         """Search to the end, and return the best of what finer meshes have judged."""
@@ -300,16 +296,12 @@ class Descent:
             if self.known.ending:
                 return found
             self.state = now
-        for _ in range(ROUNDS):
-            ending = self._searched()
-            found, limits = self._judged(start, ending)
-            kept = all(one.met for one in limits)
-            if self.done >= self.iterations or (kept and not self.search.spent):
-                break
-            self._tighten(limits)
+        ending = self._searched()
+        found, limits = self._judged(start, ending)
         for _ in range(REPAIRS):
-            if all(one.met for one in found.limits) or not self._meets(limits):
+            if all(one.met for one in found.limits):
                 break
+            self._repair(limits)
             found, limits = self._judged(start, ending)
         self._keep(ending)
         return replace(found, ending=ending)
@@ -342,78 +334,66 @@ class Descent:
 
     def _judged(self, start: str, ending: str) -> tuple[Found, tuple[Limit, ...]]:
         """Return the best of what is judged, the state now among it, and the state's limits."""
-        # Curves, or walls, that all but touch cannot be meshed: then those before them are judged.
-        problem: Exception | None = None
+        # Sides that all but touch cannot be meshed: then those before them are judged.
         for outlines in (self.state.outlines, *reversed(self.search.passed)):
-            scene, made = self.problem.scene, self.problem.parts_of(outlines)
-            try:
-                column = _judged(scene, made)
-            except (ConvergenceError, InputError) as error:
-                problem = error
-                continue
-            self.state = replace(self.state, outlines=outlines)
-            break
+            made = self.problem.parts_of(outlines)
+            with suppress(ConvergenceError, InputError):
+                column = _judged(self.problem.scene, made)
+                break
         else:
             if self.best is None:
-                assert problem is not None
-                raise problem
-            return replace(self.best, iterations=self.done), self.best.limits
-        value, limits = column.objective, column.limits
-        found = Found(start, made, self.done, value, limits, ending)
-        if self.best is not None:
-            known = self.best
-            worse = _rank(scene, value, limits) >= _rank(scene, known.value, known.limits)
-            found = replace(known, iterations=self.done) if worse else found
-        if found.parts is made:
-            self.forms = outlines
-        self.best = found
-        return found, limits
+                raise ConvergenceError("no parts of this search can be simulated")
+            return self.best, self.best.limits
+        self.state = replace(self.state, outlines=outlines)
+        found = Found(start, made, self.done, column.objective, column.limits, ending)
+        if self.best is None or self._rank(found) < self._rank(self.best):
+            self.best, self.forms = found, outlines
+        return replace(self.best, iterations=self.done), found.limits
+
+    def _rank(self, found: Found) -> tuple[float, float]:
+        return _rank(self.problem.scene, found.value, found.limits)
 
     def _tighten(self, limits: tuple[Limit, ...]) -> None:
         """Go on with limits that are tighter by what the finer mesh shows."""
-        self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
-        problem, state = self.problem, self.state
-        if state.places:  # as the search judges them
-            problem, state = problem.calibrated(state)
-        loop = {one.name: one for one in problem.limits_of(state)}
+        self.problem, self.state = self.problem.calibrated(self.state)
+        loop = {one.name: one for one in self.problem.limits_of(self.state)}
         missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
-        if not missing:
-            return
         self.tell("tightened by what the finer mesh shows: " + ", ".join(missing))
         self.problem = replace(self.problem, tightened={**self.problem.tightened, **missing})
-        self.state = self.problem.evaluated(self.state.outlines, {}, self.state.solutions)
 
     def _searched(self) -> str:
         """Go from the state to the best one that steps lead to; return why it ended."""
-        self.search = self._begun(self.state)
+        self.search = Search(self.problem, self.state)
         self.state = self.state.released
-        most = ceil(FIRST * self.iterations) if self.best is None else self.iterations
-        ending = self.search.run(most - self.done, self._told, self.done)
-        self.done, self.search.steps = self.done + self.search.steps, 0
+        ending = self._ran(self.search)
         self.state = self._best_state()
-        while self.best is None and self.done < most and self._without_struts(most):
+        while self.done < self.iterations and self._without_struts():
             pass
         return ending
 
-    def _meets(self, limits: tuple[Limit, ...]) -> bool:
-        """Take further steps, which meet limits above all; return whether sides can."""
+    def _ran(self, search: Search) -> str:
+        """Let a search take the steps that are left; return why it ended."""
+        self.search = search
+        ending = search.run(self.iterations - self.done, self._told, self.done)
+        self.done, search.steps = self.done + search.steps, 0
+        return ending
+
+    def _repair(self, limits: tuple[Limit, ...]) -> None:
+        """Take a few more steps, which meet the limits as tight as the finer mesh asks for."""
         self._tighten(limits)
-        self.search = self._begun(self.state)
-        if not isinstance(self.search, SidesSearch):
-            return False
+        self.search = Search(self.problem, self.state)
         self.search.restore(self._told, self.done)
         self.done, self.search.steps = self.done + self.search.steps, 0
         self.state = self.search.state
-        return True
 
-    def _without_struts(self, most: int) -> bool:
+    def _without_struts(self) -> bool:
         """Go on from the best state without a strut, if a few steps make one that is better."""
         promised, state = [], self.state
         plain = replace(self.problem, local={})
         with counted() as work:
             plain.evaluated(state.outlines, {}, state.solutions)
         for k, one in state.outlines.items():
-            for other in one.without_struts() if isinstance(one, FreeSides) else ():
+            for other in one.without_struts():
                 try:
                     with counted(LONG * work.done):  # what takes long hardly hangs together
                         outlines = {**state.outlines, k: other}
@@ -422,30 +402,22 @@ class Descent:
                     continue
                 missed = np.maximum(tried.values[1:], 0.0).max(initial=0.0)
                 promised.append((tried.values[0] + MISSED * abs(tried.values[0]) * missed, tried))
-        promised.sort(key=lambda one: one[0])
-        for _, tried in promised[:TRIED]:
-            search = SidesSearch(plain, tried)
-            search.run(min(FEW, most - self.done), lambda _: None, self.done)
-            self.done += search.steps
-            if search.best.rank[0] <= self.state.rank[0] and (
-                search.best.rank[1] < self.state.rank[1] - GAIN * abs(self.state.values[0])
-            ):
-                self.tell("better without a strut")
-                self.search = SidesSearch(search.problem, search.best)
-                self.search.run(most - self.done, self._told, self.done)
-                self.done, self.search.steps = self.done + self.search.steps, 0
-                self.state = self.search.best
-                return True
-            if self.done >= most:
-                return False
-        return False
-
-    def _begun(self, state: State) -> SidesSearch | SurfaceSearch:
-        if all(isinstance(one, FreeSides) for one in state.outlines.values()):
-            return SidesSearch(self.problem, state)
-        return SurfaceSearch(self.problem, state)
+        if not promised:
+            return False
+        _, tried = min(promised, key=lambda one: one[0])
+        search = Search(plain, tried)
+        search.run(min(FEW, self.iterations - self.done), lambda _: None, self.done)
+        self.done += search.steps
+        best = search.best.rank
+        if best[0] > state.rank[0] or best[1] > state.rank[1] - GAIN * abs(state.values[0]):
+            return False
+        self.tell("better without a strut")
+        self.state = search.best
+        self._ran(Search(search.problem, search.best))
+        self.state = self._best_state()
+        return True
 
 
-def _restored(outlines: Mapping[int, FreeForm], forms: Forms) -> dict[int, FreeForm]:
+def _restored(outlines: Outlines, forms: Forms) -> dict[int, FreeSides]:
     """Return what outlines had become, by what was kept of them."""
     return {k: outlines[k].restored(arrays) for k, arrays in forms.items()}

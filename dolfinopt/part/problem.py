@@ -14,7 +14,6 @@ from dolfinopt.part.check import STRESS, Simulated, simulate_parts
 from dolfinopt.part.mesh import FINE, TURN, BodyMesh, PlateMesh
 from dolfinopt.part.part import Part, PartMesh
 from dolfinopt.part.plane.free_sides import FreeSides
-from dolfinopt.part.solid.free_surface import FreeSurface
 from dolfinopt.part.stress import OutlineStress
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
@@ -25,16 +24,11 @@ from dolfinopt.responses.stress import arm_loads, maxima, motions_of
 from dolfinopt.scene.load import Scene
 
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
-STRESS_EXPONENT = 16.0  # at least: peaks are at fillets, not all along
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
 NEAR = -0.2  # of the stress of a place: from there on a finer mesh is asked
-ALLOWED = (
-    0.05  # excess of a limit that a state may have for a better objective: a later step ends it
-)
-LEAST_FINE, MOST_FINE = 0.9, 1.3  # stress of a place on a finer mesh over that on this one
+ALLOWED = 0.05  # excess of a limit that a state may have for a better objective on the way
 
 Place = tuple[int, int]  # number of an arm, and of a piece of its outline
-FreeForm = FreeSides | FreeSurface  # of one part: variables x, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +42,12 @@ class State:
         smooth, held: (k,) smooth value of each of them, and its limit, tightened and scaled so that
             the true value is limited.
         shares: relative constraints of the volumes.
-        places: relative constraint of the stress of every fillet and side; empty of surfaces.
+        places: relative constraint of the stress of every fillet and side.
         means: p-mean, Pa, of the stress of each of them, which it follows while a mesh does.
         owners: (n,) number of the place of every node of the arms' meshes; -1: none.
     """
 
-    outlines: Mapping[int, FreeForm]
+    outlines: Mapping[int, FreeSides]
     bodies: Mapping[int, Any]
     simulated: Simulated
     limits: tuple[Limit, ...]
@@ -83,8 +77,6 @@ class State:
     def rank(self) -> tuple[float, float]:
         """What orders states, best first: feasible ones by their objective, else by excess."""
         excess, value = self.values[1:].max(initial=0.0), self.values[0]
-        if not self.places:
-            return (excess if excess > EXCESS else 0.0), value
         return max(excess - ALLOWED, 0.0), value + abs(value) * max(excess - EXCESS, 0.0)
 
     @property
@@ -112,7 +104,6 @@ class Problem:
         scene: of the run.
         parts: as they were, of the arms that repeat another's design, too.
         tightened: factor by the name of a limit, by which its value counts more.
-        by_places: whether stress is limited place by place.
         local: stress of a place on a finer mesh, over its limit, by the p-mean on this one, 1/Pa.
         turns: (n,) of all pieces of an arm's sides along a side of their mesh, rad.
         stiffening: whether bodies have geometric stiffness; None: as the scene states.
@@ -121,30 +112,28 @@ class Problem:
     scene: Scene
     parts: Mapping[int, Any]
     tightened: Mapping[str, float]
-    by_places: bool = False
     local: Mapping[Place, float] = field(default_factory=dict)
     turns: Mapping[int, np.ndarray] = field(default_factory=dict)
     stiffening: bool | None = None
 
-    def every(self, outlines: Mapping[int, FreeForm]) -> dict[int, FreeForm]:
+    def every(self, outlines: Mapping[int, FreeSides]) -> dict[int, FreeSides]:
         """Return the outlines with those of arms that repeat them."""
         found = dict(outlines)
         for k, pattern in self.scene.patterns.items():
             found[k] = outlines[pattern].scaled(self.parts[k], self._factors(k))
         return {k: found[k] for k in sorted(found)}
 
-    def parts_of(self, outlines: Mapping[int, FreeForm]) -> dict[int, Part]:
+    def parts_of(self, outlines: Mapping[int, FreeSides]) -> dict[int, Part]:
         """Return the parts of all arms with these outlines."""
-        return {k: one.made for k, one in self.every(outlines).items()}
+        return {k: one.current for k, one in self.every(outlines).items()}
 
     def _factors(self, k: int) -> np.ndarray:
         """Return the sizes of an arm over those of the one whose design it repeats."""
         one, other = self.scene.arms[k], self.scene.arms[self.scene.patterns.get(k, k)]
-        sizes = [one.length / other.length, one.height / other.height]
-        return np.array([*sizes, one.thickness / other.thickness][: self.scene.dimension])
+        return np.array([one.length / other.length, one.height / other.height])
 
     def evaluated(
-        self, outlines: Mapping[int, FreeForm], bodies: Mapping[int, PartMesh], *start: Any
+        self, outlines: Mapping[int, FreeSides], bodies: Mapping[int, PartMesh], *start: Any
     ) -> State:
         """Return what the machine does; on meshes that are made anew where none are given.
 
@@ -154,10 +143,7 @@ class Problem:
         """
         every = self.every(outlines)
         if not bodies:
-            anew = {k: self._meshed(k, one) for k, one in every.items()}
-            every = {k: one for k, (one, _) in anew.items()}
-            outlines = {k: every[k] for k in outlines}
-            bodies = {k: mesh for k, (_, mesh) in anew.items()}
+            bodies = {k: one.meshed(self.turns.get(k)) for k, one in every.items()}
         parts = {k: one.current for k, one in every.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
         if self.stiffening is not None:
@@ -172,16 +158,10 @@ class Problem:
                 rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
         limit, owners = self.scene.constraints.limit(STRESS), dict[int, np.ndarray]()
         places, means = dict[Place, float](), dict[Place, float]()
-        if limit is not None and self.by_places:
+        if limit is not None:
             places, means, owners = self._places(simulated, every, bodies, limit)
-        elif limit is not None:
-            stress, analysis = self._outline_stress(simulated, every)
-            measured = stress.measure(analysis)
-            true, smooth = measured.values[0], measured.smooth[0]
-            one = Limit(STRESS, "", true, limit, "Pa")
-            rows.append((one, smooth, limit * smooth / true / self._factor(one)))
         known, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
-        shares = [area / most - 1.0 for area, most, _ in self._volumes(outlines)]
+        shares = [share for share, _ in self._volumes(outlines)]
         smooth, most, areas = (np.array(one, dtype=float) for one in (smooths, held, shares))
         given = outlines, bodies, simulated, tuple(known), smooth, most, areas
         return State(*given, places, means, owners)
@@ -189,7 +169,7 @@ class Problem:
     def _places(
         self,
         simulated: Simulated,
-        every: Mapping[int, FreeForm],
+        every: Mapping[int, FreeSides],
         bodies: Mapping[int, Any],
         limit: float,
     ) -> tuple[dict[Place, float], dict[Place, float], dict[int, np.ndarray]]:
@@ -203,7 +183,7 @@ class Problem:
             motion = [one.coefficients for one in loads]
             each = [maxima(MPI.COMM_SELF, points.A, a)[0] for a in motion]
             stress = np.max(each, axis=0)
-            means_of = points.means(motion, self._exponent(PLACE_EXPONENT))
+            means_of = points.means(motion, self._exponent)
             face = _face(bodies[k])
             near = cKDTree(face.points[face.sides[:, 0]]).query(points.places[:, :2])[1]
             counts = part.regular(points.places, scene.objective.stress_margin)
@@ -226,12 +206,11 @@ class Problem:
         return found
 
     def _place_stress(self, state: State, key: Place) -> tuple[OutlineStress, Analysis]:
-        nodes = {key[0]: state.owners[key[0]] == key[1]}
-        every = self.every(state.outlines)
-        return self._outline_stress(state.simulated, every, PLACE_EXPONENT, nodes)
-
-    def _meshed(self, k: int, one: FreeForm) -> tuple[FreeForm, PartMesh]:
-        return one.meshed(self.turns.get(k))
+        nodes, one = {key[0]: state.owners[key[0]] == key[1]}, state.simulated
+        parts = self.parts_of(state.outlines)
+        given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
+        options = one.scene.objective.unchecked_copy({"stress_exponent": self._exponent})
+        return OutlineStress(options, parts, nodes), analysis_of(*given)
 
     def calibrated(self, state: State) -> tuple[Problem, State]:
         """Return the problem that knows what finer meshes say, and a state on new meshes."""
@@ -241,10 +220,10 @@ class Problem:
             return plain, fresh
         finest = replace(plain, turns=_turns(fresh, 0.5 * FINE))
         fine = finest.evaluated(state.outlines, {}, fresh.solutions).places
-        places = {}
-        for key, value in fresh.places.items():
-            ratio = (1.0 + fine.get(key, value)) / (1.0 + value) if value > NEAR else 1.0
-            places[key] = (1.0 + value) * min(max(ratio, LEAST_FINE), MOST_FINE) - 1.0
+        places = {
+            key: fine.get(key, value) if value > NEAR else value
+            for key, value in fresh.places.items()
+        }
         local = {key: (1.0 + value) / fresh.means[key] for key, value in places.items()}
         return replace(plain, local=local), replace(fresh, places=places)
 
@@ -260,39 +239,28 @@ class Problem:
     def _factor(self, one: Limit) -> float:
         return self.tightened.get(one.name, 1.0 + RESERVE)
 
-    def _outline_stress(
-        self,
-        simulated: Simulated,
-        outlines: Mapping[int, FreeForm],
-        exponent: float = STRESS_EXPONENT,
-        nodes: Mapping[int, np.ndarray] | None = None,
-    ) -> tuple[OutlineStress, Analysis]:
-        """Return the stress on the outlines as a response, and what it is computed from."""
-        parts = {k: one.current for k, one in outlines.items()}
-        one, p = simulated, self._exponent(exponent)
-        given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
-        options = one.scene.objective.unchecked_copy({"stress_exponent": p})
-        return OutlineStress(options, parts, nodes), analysis_of(*given)
+    @property
+    def _exponent(self) -> float:
+        return max(self.scene.objective.stress_exponent, PLACE_EXPONENT)
 
-    def _exponent(self, least: float) -> float:
-        return max(self.scene.objective.stress_exponent, least)
-
-    def _volumes(
-        self, outlines: Mapping[int, FreeForm]
-    ) -> list[tuple[float, float, tuple[int, ...]]]:
-        """Return area, largest area (m2) and arms of every limit of the volume."""
+    def _volumes(self, outlines: Mapping[int, FreeSides]) -> list[tuple[float, np.ndarray]]:
+        """Return volume over its limit, less 1, and its derivatives (n,), of every such limit."""
         share = self.scene.design.volume_fraction
         if share is None:
             return []
-        area = {k: one.size for k, one in outlines.items()}
-        most = {
-            # What the densities have: curves may have begun a little above the limit.
-            k: max(share * one.part.domain.whole, one.part.domain.volume)
-            for k, one in outlines.items()
-        }
+        sizes, most, slopes, first = [], [], [], 0
+        count = sum(one.count for one in outlines.values())
+        for one in outlines.values():
+            domain, row = one.part.domain, np.zeros(count)
+            row[first : first + one.count] = domain.thickness * one.area_by_x()
+            first += one.count
+            sizes.append(domain.thickness * one.sides.shape.area)
+            # What the densities have: sides may have begun a little above the limit.
+            most.append(domain.thickness * max(share * domain.whole, domain.volume))
+            slopes.append(row)
         if self.scene.design.shared_volume:
-            return [(sum(area.values()), sum(most.values()), tuple(outlines))]
-        return [(area[k], most[k], (k,)) for k in outlines]
+            sizes, most, slopes = [sum(sizes)], [sum(most)], [np.sum(slopes, axis=0)]
+        return [(s / m - 1.0, row / m) for s, m, row in zip(sizes, most, slopes, strict=True)]
 
     def slopes(self, state: State) -> np.ndarray:
         """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""
@@ -307,24 +275,8 @@ class Problem:
         for limit, row in zip(every, found, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
-        if self.scene.constraints.limit(STRESS) is not None and not self.by_places:
-            stress, analysis = self._outline_stress(one, self.every(state.outlines))
-            (row,) = stress.gradients(analysis)
-            rows.append({k: g / state.held[len(rows) - 1] for k, g in row.items()})
-        parts = [self._by_x(state, rows)]
-        volumes = self._volumes(state.outlines)
-        if volumes:
-            shares = [
-                np.concatenate(
-                    [
-                        o.size_by_x() / most if k in arms else np.zeros(o.count)
-                        for k, o in state.outlines.items()
-                    ]
-                )
-                for _, most, arms in volumes
-            ]
-            parts.append(np.array(shares))
-        return np.vstack(parts)
+        volumes = [row for _, row in self._volumes(state.outlines)]
+        return np.vstack([self._by_x(state, rows), *volumes])
 
     def _by_x(self, state: State, rows: list[dict[int, np.ndarray]]) -> np.ndarray:
         """Return derivatives (m, n) by x from those by the nodes of the arms' meshes."""

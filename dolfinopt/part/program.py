@@ -8,8 +8,6 @@ Source: Mehrotra, SIAM J. Optim. 2 (1992) 575-601, doi:10.1137/0802028.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
@@ -38,20 +36,22 @@ def solve(
     """
     n, m, q = len(g), len(f), len(prices)
     size = max(float(np.abs(g).max(initial=0.0)), 1e-300)
-    C = Rows(np.block([[F, -np.eye(q)[slack]], [A, np.zeros((len(b), q))]]), n)
+    x, s, none = np.eye(n), np.eye(q), np.zeros
+    rows = [[F, -s[slack]], [A, none((len(b), q))], [none((q, n)), -s]]
+    C = np.block([*rows, [x, none((n, q))], [-x, none((n, q))]])
     d = np.concatenate([-f, b, np.zeros(q), np.ones(2 * n)])
     Q = np.zeros((n + q, n + q))
     Q[:n, :n] = H / size
     Q += 1e-10 * np.eye(n + q)
     c = np.concatenate([g, prices]) / size
     z = np.concatenate([np.zeros(n), np.full(q, f.max(initial=0.0) + 0.1)])
-    w, y = np.maximum(d - C.times(z), 0.1), np.full(len(d), 0.1 * c.max(initial=1.0))
+    w, y = np.maximum(d - C @ z, 0.1), np.full(len(d), 0.1 * c.max(initial=1.0))
     for _ in range(STEPS):
-        dual, primal, mean = Q @ z + c + C.transposed(y), C.times(z) + w - d, w @ y / len(d)
+        dual, primal, mean = Q @ z + c + y @ C, C @ z + w - d, w @ y / len(d)
         off = np.abs(dual).max() / (1.0 + np.abs(c).max())
         if max(off, np.abs(primal).max(), mean) < CLOSE:
             break
-        K = Q + C.weighed(y / w)
+        K = Q + (C.T * (y / w)) @ C
         try:
             factor = cho_factor(K + 1e-13 * np.diag(np.diag(K)), check_finite=False)
         except LinAlgError:
@@ -68,37 +68,8 @@ def solve(
     return np.clip(z[:n], -1.0, 1.0), size * y[:m]
 
 
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """The rows of all limits: dense ones (m, n + q), then s >= 0, x <= 1 and x >= -1."""
-
-    dense: np.ndarray
-    count: int  # n
-
-    def times(self, z: np.ndarray) -> np.ndarray:
-        """Return them times z (n + q,)."""
-        x, s = z[: self.count], z[self.count :]
-        return np.concatenate([self.dense @ z, -s, x, -x])
-
-    def transposed(self, y: np.ndarray) -> np.ndarray:
-        """Return their transpose times y."""
-        parts = y[len(self.dense) :]
-        above, below = parts[-2 * self.count : -self.count], parts[-self.count :]
-        bounds = np.concatenate([above - below, -parts[: -2 * self.count]])
-        return np.asarray(self.dense.T @ y[: len(self.dense)] + bounds)
-
-    def weighed(self, weights: np.ndarray) -> np.ndarray:
-        """Return the sum of their outer products with themselves (n + q, n + q)."""
-        m = len(self.dense)
-        bounds = weights[m:]
-        sums = bounds[-2 * self.count : -self.count] + bounds[-self.count :]
-        found = (self.dense.T * weights[:m]) @ self.dense
-        found[np.diag_indices_from(found)] += np.append(sums, bounds[: -2 * self.count])
-        return np.asarray(found)
-
-
 def _direction(
-    C: Rows,
+    C: np.ndarray,
     factor: tuple[np.ndarray, bool],
     w: np.ndarray,
     y: np.ndarray,
@@ -107,9 +78,9 @@ def _direction(
     target: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return Newton's step of unknowns, slacks w and multipliers y, whose products shall fall."""
-    right = -dual - C.transposed((y * primal - target) / w)
+    right = -dual - ((y * primal - target) / w) @ C
     dz = cho_solve(factor, right, check_finite=False)
-    dw = -primal - C.times(dz)
+    dw = -primal - C @ dz
     return dz, dw, (-target - y * dw) / w
 
 

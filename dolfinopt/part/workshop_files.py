@@ -11,7 +11,6 @@ import io
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from typing import Any
 from xml.sax.saxutils import quoteattr
 
@@ -22,9 +21,6 @@ from dolfinopt.part.solid.surface import Surface
 
 MM = 1e3  # of a metre
 HALF = 0.9 * np.pi  # sweep of an arc from which on it is divided
-# Polynomials of an edge of the face: with 8 Open CASCADE finds its area to 5e-4 (24: 6e-3; a closed
-# spline around a hole as one edge: 0.5).
-SPANS = 8
 DATE = "2000-01-01T00:00:00"  # of all files, as in DXF: a shape always gives the same bytes
 UP = (0.0, 0.0, 1.0)
 
@@ -33,10 +29,10 @@ def face_text(shape: Shape, name: str) -> str:
     """Return a STEP file with the face in z = 0 as product `name`.
 
     The edges of interfaces are named "inboard" and "outboard": `arms.mesh` reads the file back.
-    Splines are cut into edges of at most `SPANS` polynomials, see `solid_text`.
+    Splines are cut at their knots, see `solid_text`.
     """
     file = _File()
-    loops = [_Loop(file, _edges(loop, SPANS)) for loop in shape.loops]
+    loops = [_Loop(file, _edges(loop)) for loop in shape.loops]
     edges = [loop.edges(0.0) for loop in loops]
     face = _flat_face(file, edges, 0.0, upwards=True)
     shell = file.add(f"OPEN_SHELL('',({face}))")
@@ -52,7 +48,7 @@ def solid_text(shape: Shape, thickness: float, name: str, bottom: float = 0.0) -
     of many.
     """
     file = _File()
-    loops = [_Loop(file, _edges(loop, 1)) for loop in shape.loops]
+    loops = [_Loop(file, _edges(loop)) for loop in shape.loops]
     z0, z1 = MM * bottom, MM * (bottom + thickness)
     below = [loop.edges(z0) for loop in loops]
     above = [loop.edges(z1) for loop in loops]
@@ -70,34 +66,20 @@ def solid_text(shape: Shape, thickness: float, name: str, bottom: float = 0.0) -
 # -- STEP: curves ------------------------------------------------------------------------------
 
 
-def _edges(loop: Iterable[Piece], spans: int) -> list[tuple[Curve, str]]:
-    """Return a loop's curves and their names; splines of at most so many polynomials."""
-    return [
-        (one, piece.label)
-        for piece in loop
-        for curve in _arcs(piece.curve)
-        for one in (_portions(curve, spans) if isinstance(curve, Spline) else [curve])
-    ]
+def _edges(loop: Iterable[Piece]) -> list[tuple[Curve, str]]:
+    """Return a loop's curves and their names: arcs below half a turn, splines by polynomials."""
+    return [(curve, piece.label) for piece in loop for curve in _portions(piece.curve)]
 
 
-def _arcs(curve: Curve) -> list[Curve]:
-    """Return an arc, but for a circle, in pieces below half a turn; other curves as they are."""
+def _portions(curve: Curve) -> list[Curve]:
+    if isinstance(curve, Spline):
+        knots = np.repeat([0.0, 1.0], DEGREE + 1)
+        return [Spline(knots, points) for points in curve.bezier()]
     if not isinstance(curve, Arc) or curve.is_circle or abs(curve.sweep) <= HALF:
         return [curve]
     count = int(np.ceil(abs(curve.sweep) / HALF))
     part = curve.sweep / count
     return [Arc(curve.centre, curve.radius, curve.begin + k * part, part) for k in range(count)]
-
-
-def _portions(curve: Spline, spans: int) -> list[Curve]:
-    """Return a spline in portions of at most so many polynomials, as equal as may be."""
-    if spans == 1:
-        knots = np.repeat([0.0, 1.0], DEGREE + 1)
-        return [Spline(knots, points) for points in curve.bezier()]
-    ends = curve.breaks
-    count = int(np.ceil((len(ends) - 1) / spans))
-    cuts = ends[np.rint(np.linspace(0, len(ends) - 1, count + 1)).astype(int)]
-    return [curve.part(a, b) for a, b in pairwise(cuts)] if count > 1 else [curve]
 
 
 # -- STEP: topology ----------------------------------------------------------------------------

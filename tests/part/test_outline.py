@@ -11,7 +11,6 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.part.domain import loops, recognise
 from dolfinopt.part.part import Curves
-from dolfinopt.part.plane import outline
 from dolfinopt.part.plane.curves import (
     Arc,
     Line,
@@ -20,7 +19,7 @@ from dolfinopt.part.plane.curves import (
     direction,
     sampled,
 )
-from dolfinopt.part.plane.outline import draw_outline, search
+from dolfinopt.part.plane.outline import draw_outline
 from dolfinopt.part.plane.part import make_part
 
 pytestmark = pytest.mark.serial
@@ -185,33 +184,14 @@ def test_tapered_arm_with_a_boss_from_step(design, tmp_path):
     assert {round(c.radius, 8) for c in exact if isinstance(c, Arc)} >= {0.04, 0.02}
 
 
-@pytest.mark.parametrize(
-    ("size", "root", "most"),
-    [
-        (lambda x: x**3 - 0.2, 0.2 ** (1.0 / 3.0), 10),
-        (lambda x: np.exp(5.0 * x) - 2.0, np.log(2.0) / 5.0, 14),
-        (lambda x: -1.0 if x < 0.2 else 0.1 * (x - 0.5), 0.5, 14),  # nothing is left
-        (lambda x: 0.3 * x - (0.2 if x < 0.31 else -0.1), 0.31, 18),  # no root, a leap
-    ],
-)
-def test_search_finds_roots_and_leaps(size, root, most):
-    tried = []
-    found = search(lambda x: tried.append(x) or x, size, 0.0, 1.0, (-1.0, 1.0), 1e-4)
-    assert found == pytest.approx(root, abs=2e-3)
-    assert len(tried) <= most
-
-
-def test_checkerboard_is_refused_before_it_is_drawn(design, monkeypatch):
-    """Its union of thousands of pieces took minutes; a chain of corners alone is drawn."""
+def test_checkerboard_is_refused(design):
+    """Its cells touch in corners alone."""
 
     def density(x, y):
         return np.rint((x - x.min()) / 0.02 + (y - y.min()) / 0.005).astype(int) % 2 == 0
 
-    board = design(density, "arms.cells=[50,12]")
-    assert board.contacts > 400
-    monkeypatch.setattr(outline, "_given", None)
-    with pytest.raises(InputError, match="checkerboard"):
-        outline.draw_outline(board, 1e-3, 1e-4)
+    with pytest.raises(InputError, match="arm 'arm1'"):
+        make_part(design(density, "arms.cells=[50,12]"))
 
 
 # -- lines, arcs and splines, the shapes behind polygons, and splines through points  -------------

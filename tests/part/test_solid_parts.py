@@ -422,7 +422,7 @@ def test_member_of_one_cell_keeps_its_size(domain_with):
 
 def test_no_part_can_be_made(domain_with):
     for density, words in (
-        (lambda x, y, z: 1.0 * (np.abs(x - 0.25) > 0.1), "and joins both interfaces"),
+        (lambda x, y, z: 1.0 * (np.abs(x - 0.25) > 0.1), "does not hang together"),
         (lambda x, y, z: np.full_like(x, 0.5), "too grey for a part"),
     ):
         with pytest.raises(InputError, match=f"arm 'arm1': .*{words}"):

@@ -157,32 +157,21 @@ class Spline:
         return self.points[-1]
 
     @property
+    def _whole(self) -> BSpline:
+        return BSpline.construct_fast(self.knots, self.points, DEGREE)
+
+    @property
     def breaks(self) -> np.ndarray:
         """Where its polynomials meet, ends included."""
         return np.unique(self.knots)
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return the points (n, 2) at parameters (n,), m."""
-        whole = BSpline.construct_fast(self.knots, self.points, DEGREE)
-        return whole(np.asarray(t, dtype=float))
+        return self._whole(np.asarray(t, dtype=float))
 
     def derivative(self, t: np.ndarray, order: int = 1) -> np.ndarray:
         """Return a derivative (n, 2) by t, m."""
-        knots = self.knots[order:-order]
-        slope = BSpline.construct_fast(knots, self.derived(order), DEGREE - order)
-        return slope(np.asarray(t, dtype=float))
-
-    def derived(self, order: int) -> np.ndarray:
-        """Return the control points (n - order, 2) of a derivative by t, m.
-
-        Its knots are the curve's without so many at each end.
-        """
-        knots, points = self.knots, self.points
-        for degree in range(DEGREE, DEGREE - order, -1):
-            width = knots[degree + 1 : -1] - knots[1 : -degree - 1]
-            points = degree * np.diff(points, axis=0) / width[:, None]
-            knots = knots[1:-1]
-        return points
+        return self._whole.derivative(order)(np.asarray(t, dtype=float))
 
     def parameters(self, tolerance: float) -> np.ndarray:
         """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
@@ -256,21 +245,13 @@ def curvature(curve: Curve, t: np.ndarray) -> np.ndarray:
     if isinstance(curve, Arc):
         return np.full(len(t), np.sign(curve.sweep) / curve.radius)
     d, dd = curve.derivative(t), curve.derivative(t, 2)
-    speed = np.maximum(np.linalg.norm(d, axis=1), np.finfo(float).tiny)
-    return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / speed**3
+    return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3
 
 
 def direction(curve: Curve, t: float) -> np.ndarray:
     """Return the unit tangent (2,) at a parameter."""
     d = curve.derivative(np.array([t]))[0]
-    size = np.linalg.norm(d)
-    if size == 0.0:  # a spline whose first control points coincide
-        d = (
-            curve.at(np.array([min(t + 1e-3, 1.0)]))[0]
-            - curve.at(np.array([max(t - 1e-3, 0.0)]))[0]
-        )
-        size = np.linalg.norm(d)
-    return d / size
+    return np.asarray(d / np.linalg.norm(d))
 
 
 def _inside(ends: np.ndarray) -> np.ndarray:
@@ -296,6 +277,25 @@ class Piece:
     curve: Curve
     label: str = ""
     free: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Concave:
+    """A concave corner, whose radius is 0, or curve of an outline.
+
+    Attributes:
+        place: (2,) m.
+        radius: the least, m.
+        free: whether a curve that is not the arm's own is there.
+    """
+
+    place: np.ndarray
+    radius: float
+    free: bool
+
+    def __str__(self) -> str:
+        x, y = 1e3 * self.place
+        return f"({x:.1f}, {y:.1f}) mm: {1e3 * self.radius:.2g} mm"
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,23 +332,26 @@ class Shape:
         return sum(curve.area for curve in self.curves)
 
     @cached_property
-    def concave_radius(self) -> float:
-        """Smallest radius of concave places on free curves, m; infinity without any.
-
-        0 where they make a concave corner, with each other or with the arm's own.
-        """
-        least = np.inf
+    def concave(self) -> list[Concave]:
+        """Its concave corners, arcs and splines."""
+        found = []
         for loop in self.loops:
-            for before, after in zip(loop, (*loop[1:], *loop[:1]), strict=True):
+            for before, after in zip((loop[-1], *loop[:-1]), loop):
                 a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
-                if (before.free or after.free) and _cross(a, b) < -np.sin(KINK):
-                    return 0.0
+                if _cross(a, b) < -np.sin(KINK):
+                    found.append(Concave(after.curve.start, 0.0, before.free or after.free))
         for piece in self.pieces:
-            if piece.free:
-                t = np.linspace(0.0, 1.0, 33 if isinstance(piece.curve, Arc) else 2001)[1:-1]
-                bend = -curvature(piece.curve, t).min()
-                least = min(least, 1.0 / bend if bend > 0.0 else np.inf)
-        return float(least)
+            t = np.linspace(0.0, 1.0, 33)
+            bend = curvature(piece.curve, t)
+            if (least := bend.min()) < 0.0:
+                place = piece.curve.at(t)[bend.argmin()]
+                found.append(Concave(place, -1.0 / float(least), piece.free))
+        return found
+
+    @property
+    def concave_radius(self) -> float:
+        """Smallest radius of concave places beside free curves, m; infinity without any."""
+        return min((one.radius for one in self.concave if one.free), default=np.inf)
 
     def is_simple(self, tolerance: float) -> bool:
         """Return whether no curve crosses another one, as polygons within a distance see it."""

@@ -43,10 +43,8 @@ MIDDLE = 0.7  # share of a portion that its line is fitted to
 LEAST = 0.3  # length of a side that is worth drawing, cells
 SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
-SMALLEST = 3.0  # area of a hole that a search begins with, squared cells
-ATTEMPTS = (1.0, 0.6, 0.35, 0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
-SAME_AREA, ROUGHLY = 1e-3, 0.02  # relative; of few sides
-WORTH = 0.8  # of a distance from the outline, below which more sides come into question
+ATTEMPTS, COARSER = (1.0, 0.6, 0.35), (0.2, 2.0)  # shares of the tolerance, tried in turn
+SAME_AREA = 1e-3  # relative
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
 CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
@@ -88,7 +86,9 @@ class Run:
     edge: int  # number of the curve among `Domain.edges`; -1: free; their number: the axis
 
 
-def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides:
+def fitted_sides(
+    outline: Outline, limits: Limits, tolerance: float, area: float, hole: float | None = None
+) -> Sides:
     """Return the sides along an outline.
 
     Args:
@@ -96,37 +96,29 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
         limits: of the part.
         tolerance: how far they may lie from the polygon, m.
         area: to be enclosed, m2; missed where limits ask for more.
+        hole: area of the smallest hole that is drawn, m2; by default that of the tool's circle.
 
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
+    least = np.pi * limits.tool**2 if hole is None else hole
     thin = replace(limits, member=min(limits.member, THIN * limits.cell))
-    for kept in (limits, thin):  # what is thinner than asked for is told
-        best: tuple[float, float, Sides] | None = None
-        for share in ATTEMPTS:
-            made = _made(outline, kept, share * tolerance, area, np.pi * limits.tool**2)
+    for kept, shares in ((limits, ATTEMPTS), (limits, COARSER), (thin, ATTEMPTS)):
+        found: list[tuple[bool, float, Sides]] = []
+        for share in shares:
+            made = _made(outline, kept, share * tolerance, area, least)
             if made is None:
                 continue
-            off = abs(made.shape.area / area - 1.0)
-            one = off if off > SAME_AREA else 0.0, distance(made, outline), made
-            # More sides must be worth their number.
-            if best is None or (one[0], one[1]) < (best[0], WORTH * best[1]):
-                best = one
-            if best[0] == 0.0 and best[1] <= tolerance:
+            off, far = abs(made.shape.area / area - 1.0) > SAME_AREA, distance(made, outline)
+            found.append((off, far, made))
+            if not off and far <= tolerance:
                 break
-        if best is not None:
-            return best[2]
+        if found:  # what is thinner than asked for, or further off, is told
+            return min(found, key=lambda one: one[:2])[2]
     raise InputError(
         f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
         "the outline; choose another --tolerance or a smaller --tool-radius"
     )
-
-
-def rough_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides | None:
-    """Return few sides along an outline, which a search will move; None: there are none."""
-    least = SMALLEST * max(limits.cell, limits.tool) ** 2
-    made = (_made(outline, limits, share * tolerance, area, least) for share in ATTEMPTS)
-    return next((one for one in made if one and abs(one.shape.area / area - 1.0) < ROUGHLY), None)
 
 
 def _made(
@@ -179,11 +171,9 @@ def _rings(outline: Outline) -> Iterator[np.ndarray]:
                 yield points
 
 
-def _runs(points: np.ndarray, lines: Sequence[Any], chord: float, tolerance: float) -> list[Run]:
+def _runs(points: np.ndarray, lines: Sequence[Any], chord: float) -> list[Run]:
     """Cut a closed polygon where it comes to another curve."""
     on = _owners(points, lines, 3.0 * chord)
-    on = _without_dents(points, on, lines, tolerance)
-    on = _without_specks(points, on, tolerance)
     return [
         Run(points[np.append(block, block[-1] + 1) % len(points)], int(on[block[0]]))
         for block in _blocks(on)
@@ -215,32 +205,6 @@ def _blocks(on: np.ndarray) -> list[np.ndarray]:
     return [np.arange(a, b) % len(on) for a, b in zip(starts, ends, strict=True)]
 
 
-def _without_dents(
-    points: np.ndarray, on: np.ndarray, lines: Sequence[Any], depth: float
-) -> np.ndarray:
-    """Give free blocks that hardly leave a curve between two blocks of it to that curve."""
-    import shapely
-
-    blocks = _blocks(on)
-    for k, block in enumerate(blocks):
-        before, after = on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]
-        if len(blocks) > 1 and on[block[0]] == -1 and before == after != -1:
-            if shapely.distance(shapely.points(points[block]), lines[before]).max() < depth:
-                on[block] = before
-    return on
-
-
-def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarray:
-    """Make blocks on curves that are shorter than `size` free where both neighbours are."""
-    step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
-    blocks = _blocks(on)
-    for k, block in enumerate(blocks):
-        before, after = on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]
-        if len(blocks) > 1 and before == after == -1 and step[block].sum() < size:
-            on[block] = -1
-    return on
-
-
 # -- loops of sides -------------------------------------------------------------------------------
 
 
@@ -267,7 +231,7 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
     circles: list[Circle] = []
     fixed: list[tuple[Piece, ...]] = []
     for ring in _rings(outline):
-        runs = _runs(ring, lines, outline.chord, tolerance)
+        runs = _runs(ring, lines, outline.chord)
         for chain, halved in _chains(runs, len(edges) if domain.symmetric else -2):
             if _hole_area(chain, halved) < hole:
                 continue

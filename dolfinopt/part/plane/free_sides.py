@@ -32,8 +32,8 @@ from dolfinopt.part.plane.simpler import simplifications, without_struts
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
 MOST = 40  # sides and holes that go at once, at most
-FAR_STEPS = 40  # of Newton's to an outline without a strut
-WORN = 0.12  # shape of a triangle, 1 where it is equilateral, below which a new mesh is due
+# Shape of a triangle, 1 where it is equilateral, below which a new mesh is due, and over the worst.
+WORN, WORSE = 0.12, 0.7
 Mesh = BodyMesh | Tetrahedra  # of a plate in space a `PlateMesh`
 Fewer = Callable[[Sides, Limits, int], Iterator[Sides]]
 
@@ -77,17 +77,6 @@ class FreeSides:
         """The part with these sides."""
         return self.plane if self.solid is None else plate_part(self.solid, self.plane)
 
-    made = current
-
-    @property
-    def size(self) -> float:
-        """Area, m2; of a plate in space volume, m3."""
-        return self.sides.shape.area * self._thickness
-
-    @property
-    def _thickness(self) -> float:
-        return 1.0 if self.solid is None else self.part.domain.thickness
-
     @property
     def _ties(self) -> np.ndarray:
         return self.sides.ties if self.repeated is None else self.repeated
@@ -125,7 +114,7 @@ class FreeSides:
     def without_struts(self) -> Iterator[FreeSides]:
         """Yield it without one of its struts, the thinnest first."""
         for sides in without_struts(self.sides, self.limits, self.part.domain.outer_edges):
-            if (found := replace(self, sides=sides).nearest(FAR_STEPS)) is not None:
+            if (found := replace(self, sides=sides).nearest()) is not None:
                 yield found[0]
 
     def moved(self, x: np.ndarray) -> FreeSides:
@@ -136,22 +125,22 @@ class FreeSides:
         """
         return replace(self, sides=self.sides.moved(self.sides.ties @ x))
 
-    def nearest(self, steps: int = 12) -> tuple[FreeSides, np.ndarray] | None:
+    def nearest(self) -> tuple[FreeSides, np.ndarray] | None:
         """Return the nearest one that keeps the limits, and the step to it; None: there is none."""
-        found = self.limits.nearest(self.sides, steps)
+        found = self.limits.nearest(self.sides)
         return None if found is None else (replace(self, sides=found[0]), found[1])
 
-    def meshed(self, turns: np.ndarray | None = None) -> tuple[FreeSides, Mesh]:
-        """Return it with a new mesh; variables stay.
+    def meshed(self, turns: np.ndarray | None = None) -> Mesh:
+        """Return a new mesh of it.
 
         Args:
             turns: (n,) of its pieces along a side of the mesh, rad; None: `mesh.TURN`.
         """
         if self.solid is not None:
-            return self, self.current.mesh()
+            return self.current.mesh()
         if turns is None or len(turns) != len(self.sides.shape.pieces):
-            return self, self.plane.mesh(finer=())
-        return self, self.plane.mesh(finer=(), turn=turns)
+            return self.plane.mesh(finer=())
+        return self.plane.mesh(finer=(), turn=turns)
 
     def followed(self, mesh: Mesh) -> Mesh | None:
         """Return a mesh of sides nearby, moved to these; None where its triangles are spoilt."""
@@ -164,7 +153,8 @@ class FreeSides:
         if len(mesh.shape.pieces) != len(self.sides.shape.pieces):
             return None
         found = mesh.morphed(self.sides.shape)
-        return None if found.quality.min() < WORN else found
+        least = min(WORN, WORSE * mesh.quality.min())
+        return None if found.quality.min() < least else found
 
     def by_x(self, mesh: Mesh, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (m, count) by x from those (m, n, d) by the nodes of its mesh."""
@@ -179,9 +169,9 @@ class FreeSides:
             found += one.pull(mesh.span[here, 0], g[:, here], len(here))
         return found @ self._ties
 
-    def size_by_x(self) -> np.ndarray:
-        """Return the derivative (count,) of the size by x."""
-        return self.sides.area_by_q() * self._thickness @ self._ties
+    def area_by_x(self) -> np.ndarray:
+        """Return the derivative (count,) of the area by x."""
+        return self.sides.area_by_q() @ self._ties
 
     def scaled(self, part: PlanePart, factors: np.ndarray) -> FreeSides:
         """Return the sides of a part that repeats this one's design, stretched by (2,) factors.

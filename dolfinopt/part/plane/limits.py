@@ -42,6 +42,7 @@ LARGEST = 8.0  # radius of a fillet, cells
 THIN = 1e-3  # m, least width of members unless the scene states one
 FACING = 0.8  # cosine between a width and the normals at both of its ends, at least
 RETURNS = 3  # from one side to the other and back, to where they are nearest
+WIDE = 10.0  # cells: width from which on no member is told to be thin
 NEAR = 2.0  # least widths: distance up to which two pieces are looked at
 HALF = 5e-4  # m, of which rounded radii are multiples
 CHORD = 0.005  # distance of polygons from curves, cells
@@ -128,46 +129,18 @@ class Limits:
     # -- widths of members and gaps ---------------------------------------------------------------
 
     def _widths(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
-        every = [*sides.placed, *(Placed(one, None) for ring in sides.fixed for one in ring)]
-        every = [part for one in every for part in _chords(one, CHORD * self.cell)]
-        number, _, at, _ = _samples(every, self.cell)
-        most = NEAR * max(self.member, self.gap)
-        pairs = cKDTree(at).query_pairs(most + self.cell, output_type="ndarray")
-        pairs = np.vstack([pairs, pairs[:, ::-1]])
-        place, other = np.unique(np.stack([pairs[:, 0], number[pairs[:, 1]]]), axis=1)
-        apart = ~_together(every, sides)[number[place], other]
-        place, other = place[apart], other[apart]
-        own, curves = number[place], [one.piece.curve for one in every]
-        where, near, back = _closest(curves, other, at[place])
-        some = np.linalg.norm(near - at[place], axis=1) < most
-        own, other, near = own[some], other[some], near[some]
-        # Places stand apart: from one curve to the other and back they come to the narrowest one.
-        for _ in range(RETURNS):
-            s, p, out = _closest(curves, own, near)
-            where, near, back = _closest(curves, other, p)
-        v = near - p
-        width = np.linalg.norm(v, axis=1)
-        cosines = (v * out).sum(axis=1), (v * back).sum(axis=1)
-        for sign, least in ((-1.0, self.member), (1.0, self.gap)):
-            some = np.flatnonzero(
-                (width > 1e-9)
-                & (width < NEAR * least)
-                & (sign * cosines[0] > FACING * width)
-                & (-sign * cosines[1] > FACING * width)
-            )
-            key = np.sort(np.stack([own[some], other[some]]), axis=0)
-            _, group = np.unique(key, axis=1, return_inverse=True)
+        found = facing(sides, self.cell, NEAR * max(self.member, self.gap))
+        for members, least in ((True, self.member), (False, self.gap)):
+            near = np.flatnonzero((found.members == members) & (found.width < NEAR * least))
+            key = np.sort(found.pairs[near], axis=1)
+            _, group = np.unique(key, axis=0, return_inverse=True)
             for one in range(group.max(initial=-1) + 1):
-                here = some[group.ravel() == one]
-                low = here[np.argmin(width[here])]
-                same = here[own[here] == own[low]]
-                far = same[np.argmax(np.abs(s[same] - s[low]))]
+                here = near[group.ravel() == one]
+                low = here[np.argmin(found.width[here])]
+                same = here[found.pairs[here, 0] == found.pairs[low, 0]]
+                far = same[np.argmax(np.abs(found.t[same, 0] - found.t[low, 0]))]
                 for k in {low, far}:
-                    u, slope = v[k] / width[k], np.zeros(sides.numbers[0])
-                    for which, t, g in ((own[k], s[k], u), (other[k], where[k], -u)):
-                        if every[which].moves is not None:
-                            slope = slope + every[which].pull(np.array([t]), g[None, None])[0]
-                    yield least - width[k], slope
+                    yield least - found.width[k], found.by_q(k, sides.numbers[0])
 
     # -- where material may be and must be --------------------------------------------------------
 
@@ -191,18 +164,15 @@ class Limits:
 
     # -- the nearest outline that keeps them -------------------------------------------------------
 
-    def nearest(
-        self, sides: Sides, steps: int = STEPS, area: float | None = None
-    ) -> tuple[Sides, np.ndarray] | None:
+    def nearest(self, sides: Sides, area: float | None = None) -> tuple[Sides, np.ndarray] | None:
         """Return the nearest outline that keeps all limits, and the step x to it; None: none.
 
         Args:
             sides: where to begin.
-            steps: of Newton's, at most.
             area: that it shall have besides, m2.
         """
         whole = np.zeros(sides.count)
-        for _ in range(steps):
+        for _ in range(STEPS):
             try:
                 g, A = self.rows(sides)
                 margin = np.full(len(g), 0.3 * KEPT)
@@ -296,6 +266,81 @@ def _angle(sides: Sides, one: Placed, end: int) -> np.ndarray:
         by_t = (one.moves.start, one.moves.end)[end]
         found = curvature(one.piece.curve, t)[0] * speed * by_t
     return found
+
+
+# -- places of the outline that face each other --------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Facing:
+    """Pairs of places on two pieces that are nearest to each other across a member or a gap.
+
+    Attributes:
+        every: all pieces.
+        pairs: (k, 2) numbers of the two pieces.
+        t: (k, 2) parameters of the two places.
+        across: (k, 2) from the first place to the second, m.
+        members: (k,) whether there is material between them.
+    """
+
+    every: Sequence[Placed]
+    pairs: np.ndarray
+    t: np.ndarray
+    across: np.ndarray
+    members: np.ndarray
+
+    @property
+    def width(self) -> np.ndarray:
+        """(k,) m."""
+        return np.linalg.norm(self.across, axis=1)
+
+    def by_q(self, k: int, count: int) -> np.ndarray:
+        """Return the derivative (count,) by q of the width of pair k, less its sign."""
+        found, u = np.zeros(count), self.across[k] / self.width[k]
+        for which, t, g in zip(self.pairs[k], self.t[k], (u, -u), strict=True):
+            if self.every[which].moves is not None:
+                found = found + self.every[which].pull(np.array([t]), g[None, None])[0]
+        return found
+
+
+def facing(sides: Sides, cell: float, most: float) -> Facing:
+    """Return the places that face each other no further than `most` apart, m.
+
+    Args:
+        sides: the outline.
+        cell: distance of the places from which they are looked for, m.
+        most: m.
+    """
+    every = [*sides.placed, *(Placed(one, None) for ring in sides.fixed for one in ring)]
+    every = [part for one in every for part in _chords(one, CHORD * cell)]
+    number, _, at, _ = _samples(every, cell)
+    pairs = cKDTree(at).query_pairs(most + cell, output_type="ndarray")
+    pairs = np.vstack([pairs, pairs[:, ::-1]])
+    place, other = np.unique(np.stack([pairs[:, 0], number[pairs[:, 1]]]), axis=1)
+    apart = ~_together(every, sides)[number[place], other]
+    place, other = place[apart], other[apart]
+    own, curves = number[place], [one.piece.curve for one in every]
+    _, near, _ = _closest(curves, other, at[place])
+    some = np.linalg.norm(near - at[place], axis=1) < most
+    own, other, near = own[some], other[some], near[some]
+    # Places stand apart: from one curve to the other and back they come to the narrowest one.
+    for _ in range(RETURNS):
+        s, p, out = _closest(curves, own, near)
+        t, near, back = _closest(curves, other, p)
+    v = near - p
+    width = np.linalg.norm(v, axis=1)
+    cosines = np.stack([(v * out).sum(axis=1), -(v * back).sum(axis=1)])
+    far = (width > 1e-9) & (width < most)
+    members, gaps = (far & (sign * cosines > FACING * width).all(axis=0) for sign in (-1.0, 1.0))
+    kept = members | gaps
+    both = np.stack([own, other], axis=1)[kept]
+    return Facing(every, both, np.stack([s, t], axis=1)[kept], v[kept], members[kept])
+
+
+def thinnest_member(sides: Sides, cell: float) -> float | None:
+    """Return the width of the thinnest member, m; None where none is below `WIDE` cells."""
+    found = facing(sides, cell, WIDE * cell)
+    return float(found.width[found.members].min(initial=np.inf)) if found.members.any() else None
 
 
 def _chords(one: Placed, chord: float) -> list[Placed]:

@@ -2,17 +2,18 @@
 
 The density is a smooth field on a raster. What stays solid, the interfaces and the arm's own
 outline are kept; islands are dropped, and every hole, gap and concave corner is as wide as the
-tool. The level is searched for, also where the volume leaps.
+tool.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.optimize import brentq
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import INBOARD, OUTBOARD, Domain
@@ -20,73 +21,6 @@ from dolfinopt.part.plane.curves import sampled
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
-
-
-T = TypeVar("T")
-
-NARROW = 2e-4  # bracket at which the search ends, of the span
-SEARCH_STEPS = 30
-BEYOND = 1.15  # of the step to where a straight line ends
-
-
-def search(
-    at: Callable[[float], T],
-    off: Callable[[T], float],
-    first: float,
-    slope: float,
-    span: tuple[float, float],
-    enough: float,
-) -> T:
-    """Return what is nearest to the wanted size; no further off than `enough` where nothing leaps.
-
-    A bracket is looked for along straight lines, then narrowed by the secant and, as sizes may
-    leap, by halves.
-
-    Args:
-        at: what comes of a number.
-        off: by how much it is too large, relative; it grows with the number.
-        first: where to begin.
-        slope: about, of what `off` returns.
-        span: what the number may be.
-        enough: relative.
-    """
-    tried: list[tuple[float, float]] = []
-    place = min(max(first, span[0]), span[1])
-    best = at(place)
-    found, width = best, np.inf
-    for _ in range(SEARCH_STEPS):
-        excess = off(found)
-        if abs(excess) < abs(off(best)):
-            best = found
-        if abs(excess) < enough:
-            break
-        tried.append((place, excess))
-        above = min((p for p in tried if p[1] > 0.0), default=None)
-        below = max((p for p in tried if p[1] <= 0.0), default=None)
-        if above is None or below is None:
-            ahead = min(max(place - _step(tried, slope), span[0]), span[1])
-            if ahead == place:  # at the end of what it may be
-                break
-            place = ahead
-        else:
-            if abs(above[0] - below[0]) < NARROW * (span[1] - span[0]):
-                break
-            # A size may leap, as it does to nothing: then the secant hardly narrows the bracket.
-            leaps = abs(above[0] - below[0]) > 0.5 * width or max(above[1], -below[1]) > 0.5
-            width = abs(above[0] - below[0])
-            share = 0.5 if leaps else -below[1] / (above[1] - below[1])
-            place = below[0] + min(max(share, 0.03), 0.97) * (above[0] - below[0])
-        found = at(place)
-    return best
-
-
-def _step(tried: list[tuple[float, float]], slope: float) -> float:
-    """Return the step to the other side of the root: a little further than along the line there."""
-    (place, excess) = tried[-1]
-    if len(tried) > 1 and excess != tried[-2][1]:
-        steepness = (excess - tried[-2][1]) / (place - tried[-2][0])
-        slope = min(max(steepness, 0.25 * slope), 4.0 * slope)
-    return BEYOND * excess / slope
 
 
 NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
@@ -256,11 +190,10 @@ def _scattered(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 AREA = 1e-4  # relative: up to which the level is sought
-CLOSE = 1e-5  # the same of the polygon: curves that are few make up for what is missing
-LEAP = 5e-3  # relative: what the curves make up for where a piece joins or leaves at one level
+NARROW = 2e-4  # of the levels' range: bracket at which the search ends, where the area leaps
+LEAP = 0.05  # relative: what sides make up for where a piece joins or leaves at one level
 CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
 STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
-ROUGH = 0.01  # the same while a level is looked for roughly, cells
 TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
 # Material along an interface that the design leaves void, in cells: the interface is rigid.
 STRIP = 0.5
@@ -268,11 +201,8 @@ STRIP = 0.5
 # corner are joined in the finite elements.
 LINK = 0.5
 UNIFORM = 1e-3  # range of a density without outline
+NECK = 3.0  # width of necks that are cut, tolerances: sides on both of them must not meet
 PINHOLE = 0.5  # diameter of holes that are closed whatever the tool, cells
-NECK = 3.0  # width of necks that are cut, tolerances: curves on both sides must not meet
-# Corners in which solid cells touch, over solid cells, from which on a design is a checkerboard:
-# one of single cells has 2, of squares of four cells 0.5, optimised designs up to 0.08.
-CHECKERED, FEW = 0.4, 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,7 +213,6 @@ class Outline:
         domain: the arm.
         polygon: shapely's, m; with sides on the arm's own curves where it touches them.
         level: of the field.
-        offset: by which the outline was moved outwards, m; 0 where the level alone would do.
         tool_radius: m.
         chord: distance of its sides from the arm's own curves, m.
         islands, islands_area: number of pieces that join no interface and were dropped; m2.
@@ -293,7 +222,6 @@ class Outline:
     domain: Domain
     polygon: Polygon
     level: float
-    offset: float
     tool_radius: float
     chord: float
     islands: int
@@ -340,12 +268,6 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
             f"--tool-radius = {tool_radius:g} m: the tool is as wide as {where}, which is "
             f"{domain.height:g} m high; expected less than {0.5 * domain.height:g} m"
         )
-    solid = int((domain.x_phys > 0.5).sum())
-    if domain.contacts > max(CHECKERED * solid, FEW):
-        raise InputError(
-            f"{where}: its {solid} solid cells touch each other in {domain.contacts} corners: a "
-            "checkerboard has no outline; give design.filter_radius the length of two cells or more"
-        )
     given = _given(domain, CHORD * tolerance)
     target = domain.volume
     if given.stays.area > target * (1.0 + AREA):
@@ -356,17 +278,16 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
 
     if target > given.arm.area * (1.0 - AREA):
         polygon = max(polygons_of(given.arm), key=lambda p: p.area)
-        return Outline(domain, polygon, 0.0, 0.0, tool_radius, CHORD * tolerance, 0, 0.0, 0)
+        return Outline(domain, polygon, 0.0, tool_radius, CHORD * tolerance, 0, 0.0, 0)
     if float(np.ptp(domain.field)) < UNIFORM:
         raise InputError(
             f"{where}: its density is {domain.field.mean():.3g} everywhere, which has no outline; "
             "optimise it first"
         )
 
-    for field in (domain.beside, domain.field):
-        found = _found(replace(domain, field=field), given, tool_radius, tolerance)
-        if _off(found) <= LEAP:
-            return replace(found, domain=domain)
+    found = _found(domain, given, tool_radius, tolerance)
+    if _off(found) <= LEAP:
+        return found
     raise InputError(
         f"{where}: the material of the design does not hang together: at no level has the "
         "piece that joins both interfaces the design's volume; let the optimisation go on "
@@ -375,16 +296,19 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
 
 
 def _found(domain: Domain, given: _Given, tool_radius: float, tolerance: float) -> Outline:
-    """Return the outline whose area is nearest to the design's volume."""
-    raster = rasterise(domain)
+    """Return the outline of the level at which its area is nearest to the design's volume."""
+    raster, tried = rasterise(domain), list[Outline]()
 
-    def at(level: float, offset: float = 0.0) -> Outline:
-        return _at(domain, given, raster, level, offset, tool_radius, CHORD * tolerance)
+    def excess(level: float) -> float:
+        found = _at(domain, given, raster, level, tool_radius, CHORD * tolerance)
+        tried.append(found)
+        return 0.0 if _off(found) < AREA else found.area - domain.volume
 
-    found = _at_level(at, lambda level: _rough(given, raster, domain, level), domain, raster)
-    if _off(found) > LEAP:  # a large piece joins or leaves: move the outline itself
-        found = _at_offset(at, found)
-    return found
+    low, high = float(raster.values.min()), float(raster.values.max())
+    step = 0.02 * (high - low)
+    with suppress(ValueError):  # whatever the level the area is too large, or too small
+        brentq(excess, low - step, high + step, xtol=NARROW * (high - low))
+    return min(tried, key=_off)
 
 
 def _given(domain: Domain, chord: float) -> _Given:
@@ -405,16 +329,12 @@ def _given(domain: Domain, chord: float) -> _Given:
     return _Given(arm, stays, links.intersection(arm), interfaces[INBOARD], interfaces[OUTBOARD])
 
 
-def _material(
-    given: _Given, raster: Raster, level: float, offset: float, straight: float
-) -> Geometry:
+def _material(given: _Given, raster: Raster, level: float, straight: float) -> Geometry:
     """Return what is solid at a level, before a tool has been there."""
-    # The outline is moved outwards by `offset`, without corners nearer to it than `straight` (m).
+    # Without corners nearer to the level's outline than `straight` (m).
     import shapely
 
     above = shapely.simplify(raster.above(level), straight)
-    if offset:
-        above = above.buffer(offset, quad_segs=QUADRANT)
     whole = shapely.union_all([above.intersection(given.arm), given.stays])
     whole = shapely.union_all(polygons_of(whole))  # without points and lines
     missing = shapely.get_parts(given.links.difference(whole))
@@ -430,14 +350,13 @@ def _at(
     given: _Given,
     raster: Raster,
     level: float,
-    offset: float,
     tool: float,
     chord: float,
 ) -> Outline:
-    """Return the outline at a level, moved outwards by an offset, m."""
+    """Return the outline at a level."""
     import shapely
 
-    whole = _material(given, raster, level, offset, STRAIGHT * chord / CHORD)
+    whole = _material(given, raster, level, STRAIGHT * chord / CHORD)
     before = polygons_of(whole)
     if tool > 0.0:
         whole = rounded(whole, tool, chord).intersection(given.arm)
@@ -454,7 +373,6 @@ def _at(
         domain=domain,
         polygon=shapely.Polygon(main.exterior, holes) if kept else main,
         level=level,
-        offset=offset,
         tool_radius=tool,
         chord=chord,
         islands=len(dropped),
@@ -463,57 +381,9 @@ def _at(
     )
 
 
-def _excess(outline: Outline) -> float:
-    """Return by how much the area is above the volume, relative."""
-    return outline.area / outline.domain.volume - 1.0
-
-
 def _off(outline: Outline) -> float:
-    return abs(_excess(outline))
-
-
-def _rough(given: _Given, raster: Raster, domain: Domain, level: float) -> float:
-    """Return by how much the material's area is above the volume, relative."""
-    return _material(given, raster, level, 0.0, ROUGH * domain.cell).area / domain.volume - 1.0
-
-
-def _at_level(
-    at: Callable[[float], Outline],
-    rough: Callable[[float], float],
-    domain: Domain,
-    raster: Raster,
-) -> Outline:
-    """Return the outline of the level at which it has the volume's area."""
-    # `at` gives the outline by the level, `rough` its excess without all that takes time.
-    low, high = float(raster.values.min()), float(raster.values.max())
-    order = np.argsort(-domain.field)
-    filled = np.cumsum(domain.area[order])
-    # Rounding must not make the first void cell of a crisp design the last solid one.
-    last = min(int(np.searchsorted(filled, (1.0 - AREA) * domain.volume)), len(order) - 1)
-    first = domain.field[order[last]]
-    step = 0.02 * (high - low)
-    span = (-high - step, step - low)  # a lower level has more material
-    place, _ = search(
-        lambda number: (number, rough(-number)),
-        lambda tried: tried[1],
-        -float(first),
-        1.0 / (high - low),
-        span,
-        LEAP,
-    )
-    slope = (rough(-place - step) - rough(-place + step)) / (2.0 * step)
-    slope = max(slope, 0.1 / (high - low))
-    return search(lambda number: at(-number), _excess, place, slope, span, CLOSE)
-
-
-def _at_offset(at: Callable[[float, float], Outline], found: Outline) -> Outline:
-    """Return the outline at the level of `found`, moved so that it has the volume's area."""
-    most = 2.0 * found.domain.cell
-    slope = max(float(found.polygon.length), found.domain.length) / found.domain.volume
-    moved = search(
-        lambda offset: at(found.level, offset), _excess, 0.0, slope, (-most, most), CLOSE
-    )
-    return min(found, moved, key=_off)
+    """Return by how much the area differs from the volume, relative."""
+    return abs(outline.area / outline.domain.volume - 1.0)
 
 
 def without_stubs(outline: Outline, width: float) -> Outline:

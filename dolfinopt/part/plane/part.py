@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -14,13 +15,12 @@ from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import FINE, TURN, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
-from dolfinopt.part.plane.curves import Shape
+from dolfinopt.part.plane.curves import Concave, Shape
 from dolfinopt.part.plane.fit import distance, fitted_sides
-from dolfinopt.part.plane.limits import THIN, limits_of_part, rounded_radii
+from dolfinopt.part.plane.limits import THIN, limits_of_part, rounded_radii, thinnest_member
 from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
 from dolfinopt.part.plane.sides import Sides
 from dolfinopt.part.stress import corner_stress_in_plane, is_regular_in_plane
-from dolfinopt.part.widths import TightPlace, thinnest_member, tight_places
 from dolfinopt.part.workshop_files import (
     MM,
     dxf_text,
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 
 TOLD = 5  # tight places that a sentence names
+ENOUGH = 0.98  # of the tool's radius, below which it does not reach a place
 SAME_AREA, QUARTERS = 1e-4, 6  # relative, of chords to their curves; of the chords' distance
 TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
 AWAY = 0.5  # cells that sides may lie from the outline by default
@@ -82,12 +83,14 @@ class PlanePart:
     @cached_property
     def thinnest(self) -> float | None:
         """Width of its thinnest member, m; None where nothing is thin."""
-        return thinnest_member(self.shape, self.domain.cell)
+        return thinnest_member(self.sides, self.domain.cell)
 
     @cached_property
-    def tight(self) -> list[TightPlace]:
-        """Places that the tool does not reach."""
-        return tight_places(self.shape, self.outline.tool_radius, self.tolerance)
+    def tight(self) -> list[Concave]:
+        """Concave corners and curves that the tool does not reach."""
+        least = ENOUGH * self.outline.tool_radius
+        found = [one for one in self.shape.concave if one.radius < least]
+        return sorted(found, key=attrgetter("radius"))
 
     @property
     def volume(self) -> float:

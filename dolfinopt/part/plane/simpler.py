@@ -15,16 +15,22 @@ import numpy as np
 
 from dolfinopt.part.plane.curves import Line, direction
 from dolfinopt.part.plane.fit import Drawn, cleaned, looped
-from dolfinopt.part.plane.limits import SHORT, TURN, Limits
-from dolfinopt.part.plane.sides import Loop, Side, Sides, angle_of, turn_between, unit
+from dolfinopt.part.plane.limits import SHORT, TURN, Limits, facing
+from dolfinopt.part.plane.sides import (
+    LineMoves,
+    Loop,
+    Side,
+    Sides,
+    angle_of,
+    turn_between,
+    unit,
+)
 
 NEARLY = 1.2  # of the least turn, up to which a corner hardly turns
 VANISHING = 2.5  # of the least length, up to which a side vanishes
 # Of a tooth: turn at its tip, and between the sides beside it, at most; length of its sides, cells.
 TIP, FLAT, TOOTH = np.radians(45.0), np.radians(25.0), 4.0
 SMALL = 20.0  # area of a hole that may close, squared cells or tool radii
-PARALLEL = np.radians(9.0)  # angle between two sides that face each other, at most
-OVERLAP = 0.4  # share of the shorter one over which they do
 SLENDER = 1.6  # width of struts that may go, over the least width of members
 
 
@@ -83,47 +89,23 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
 
 def without_struts(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
     """Yield the outline without one of its thin struts, the thinnest first."""
-    lines, done = _lines(sides), set[frozenset[int]]()
-    for _, a, b in facing(sides, SLENDER * limits.member):
-        (i, k), (j, m) = lines[a][:2], lines[b][:2]
-        twins = {sides.loops[i].sides[k].twin, sides.loops[j].sides[m].twin}
-        name = frozenset((a, b)) | twins
-        if i == j or name in done or not sides.loops[j].sides[m].free:
+    found, done = facing(sides, limits.cell, SLENDER * limits.member), set[frozenset[int]]()
+    for n in np.argsort(found.width):
+        beside = [found.every[k] for k in found.pairs[n]]
+        if not found.members[n] or beside[0].loop == beside[1].loop:
             continue
-        done.add(name)
-        found = _spliced(sides, a, b, limits, outer)
-        one, other = twins if len(twins) == 2 else (-1, -1)
-        if found is not None and min(one, other) >= 0 and twins != {a, b}:
-            found = _spliced(found, one, other, limits, outer)
-        if found is not None:
-            yield found
-
-
-def facing(sides: Sides, widest: float) -> list[tuple[float, int, int]]:
-    """Return width, and keys of two sides that face each other over a member, thinnest first.
-
-    The first of two is one that moves.
-    """
-    found = dict[frozenset[int], tuple[float, int, int]]()
-    lines = _lines(sides)
-    for a, (i, k, one) in lines.items():
-        if not sides.loops[i].sides[k].free:
+        if not all(isinstance(one.moves, LineMoves) and one.piece.free for one in beside):
             continue
-        along = one.end - one.start
-        length = float(np.linalg.norm(along))
-        along = along / length
-        for b, (_, _, other) in lines.items():
-            d = other.end - other.start
-            size = float(np.linalg.norm(d))
-            if a == b or along @ d > -np.cos(PARALLEL) * size:
-                continue
-            low, high = sorted((end - one.start) @ along for end in (other.start, other.end))
-            gap = 0.5 * (other.start + other.end) - one.start
-            width = float(along[0] * gap[1] - along[1] * gap[0])
-            overlap = min(high, length) - max(low, 0.0)
-            if overlap > OVERLAP * min(length, size) and 0.0 < width < widest:
-                found.setdefault(frozenset((a, b)), (width, a, b))
-    return sorted(found.values())
+        a, b = (sides.loops[one.loop].sides[one.side] for one in beside)
+        keys, twins = {a.key, b.key}, {a.twin, b.twin}
+        if frozenset(keys | twins) in done:
+            continue
+        done.add(frozenset(keys | twins))
+        left = _spliced(sides, a.key, b.key, limits, outer)
+        if left is not None and min(twins) >= 0 and twins != keys and len(twins) == 2:
+            left = _spliced(left, a.twin, b.twin, limits, outer)
+        if left is not None:
+            yield left
 
 
 def _lines(sides: Sides) -> dict[int, tuple[int, int, Line]]:

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from dolfinopt.density.members import WIDE
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
-from dolfinopt.part.mesh import filled, mesh_size, solid_mesh
+from dolfinopt.part.mesh import mesh_size, solid_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
@@ -27,72 +26,19 @@ from dolfinopt.part.solid.surface import (
     cavities,
     check_surface,
     crossings,
-    distance_to_faces,
     open_edges,
     outside,
     smooth_surface,
     with_volume,
 )
+from dolfinopt.part.solid.widths import Widths, measured_widths
 from dolfinopt.part.stress import corner_stress_in_space, is_regular_in_space
-from dolfinopt.part.widths import Boundary, narrowest_place
 from dolfinopt.part.workshop_files import MM, dxf_text, solid_text, three_mf_bytes, triangle_bytes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.stress import CornerStress
-
-
-SPACINGS, MOST_POINTS = 5.0, 100_000  # points of the surface in a cell's length; in all, about
-# Steps of the sequence that fills a square most evenly: powers of the root of g^3 = g + 1.
-EVENLY = 0.7548776662466927, 0.5698402909980532
-
-
-@dataclass(frozen=True)
-class Widths:
-    """What is narrowest in a part.
-
-    Attributes:
-        member: width of its thinnest member, m; None where nothing is thin.
-        gap: of its narrowest gap, hole or cavity, m; None without one.
-        to: what is thinner than that is not seen, m.
-    """
-
-    member: float | None
-    gap: float | None
-    to: float
-
-
-def measured_widths(domain: SolidDomain, surface: Surface) -> Widths:
-    """Return the narrowest member and gap of the part of a solid arm."""
-    points, outward, spacing = _places(surface, domain.cell / SPACINGS)
-
-    def distance(places: np.ndarray) -> np.ndarray:
-        return distance_to_faces(places, surface.corners)
-
-    inside = Boundary(points, outward, spacing, distance)
-    turned = replace(inside, outward=-outward)
-    asked = max(domain.filter_radius, domain.minimum_member, domain.minimum_gap, 2.0 * domain.cell)
-    found = narrowest_place(inside), narrowest_place(turned, WIDE * asked)
-    member, gap = (None if one is None else one.size for one in found)
-    return Widths(member, gap, spacing)
-
-
-def _places(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return points on a surface, one in a triangle or more, outward normals and their spacing."""
-    a, b, c = surface.corners.swapaxes(0, 1)
-    normal = 0.5 * np.cross(b - a, c - a)
-    area = np.linalg.norm(normal, axis=1)
-    spacing = max(spacing, float(np.sqrt(area.sum() / MOST_POINTS)))
-    counts = np.maximum(np.ceil(area / spacing**2).astype(int), 1) * (area > 0.0)
-    which = np.repeat(np.arange(len(area)), counts)
-    number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
-    second, third = ((1.0 / 3.0 + number * step) % 1.0 for step in EVENLY)
-    beyond = second + third > 1.0
-    second, third = (np.where(beyond, 1.0 - one, one) for one in (second, third))
-    weights = np.stack([1.0 - second - third, second, third], axis=1)
-    points = np.einsum("nk,nka->na", weights, surface.corners[which])
-    return points, normal[which] / area[which, None], spacing
 
 
 SAME_VOLUME = 1e-4  # relative, of the part to the design
@@ -116,7 +62,6 @@ class SolidPart:
         pieces: number of pieces left out because they do not join both interfaces.
         pieces_volume: their volume, m3.
         flat: the part in the plane that it is extruded from; None of others.
-        moved: the mesh whose boundary has become its surface; None of others.
     """
 
     domain: SolidDomain
@@ -126,7 +71,6 @@ class SolidPart:
     pieces: int
     pieces_volume: float
     flat: PlanePart | None = None
-    moved: Tetrahedra | None = None
 
     COARSER: ClassVar[float] = 1.6  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 0  # of the mesh where stress is largest
@@ -284,13 +228,7 @@ class SolidPart:
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> Tetrahedra:
         """Return tetrahedra, all about as large, see `part.Part`."""
-        size = coarser * mesh_size(self)
-        try:
-            return solid_mesh(self, size)
-        except InputError:  # Gmsh finds no faces in thin walls that have moved
-            if self.moved is None or coarser > 1.0:
-                raise
-        return filled(self, self.moved, size)
+        return solid_mesh(self, coarser * mesh_size(self))
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
         """Return which places (n, 3) are away from where stress has no limit (n,)."""

@@ -10,10 +10,12 @@ surface smoothing as filter design, ECCV 1996, doi:10.1007/BFb0015544.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
@@ -357,29 +359,6 @@ def distance_to_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(np.asarray(nearest) - points, axis=1))
 
 
-def nearest_facets(
-    points: np.ndarray, corners: np.ndarray, triangles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nearest triangle (n,) of points, and the shares (n, 3) of its corners there.
-
-    Args:
-        points: (n, 3) m.
-        corners: (k, 3) m.
-        triangles: (m, 3) of the corners.
-    """
-    import pyvista
-
-    found = pyvista.PolyData.from_regular_faces(corners, triangles)
-    which, nearest = found.find_closest_cell(points, return_closest_point=True)
-    a, b, c = corners[triangles[which]].swapaxes(0, 1)
-    normal = np.cross(b - a, c - a)
-    square = np.square(normal).sum(axis=1)
-    nearest = np.asarray(nearest)
-    second = (np.cross(nearest - a, c - a) * normal).sum(axis=1) / square
-    third = (np.cross(b - a, nearest - a) * normal).sum(axis=1) / square
-    return np.asarray(which), np.stack([1.0 - second - third, second, third], axis=1)
-
-
 def with_volume(surface: Surface, free: np.ndarray, volume: float) -> Surface:
     """Return a surface whose free points are moved along their normals until it has a volume.
 
@@ -525,7 +504,7 @@ def _passes(start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarr
     return np.asarray(inside & ~flat)
 
 
-HALVINGS, NEAR = 30, 1e-3  # of the interval of levels; relative difference of volumes that will do
+FINE, NEAR = 1e-6, 1e-3  # of the level; relative difference of volumes that will do
 WHOLE = 1.0 - 1e-9  # of a mark that points between two marked nodes have, but for rounding
 FEW = (
     20_000  # cells up to which they are halved for the isosurface; of finer ones nodes tell enough
@@ -575,33 +554,24 @@ def _field(domain: SolidDomain) -> _Field:
 def at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:
     """Return the level that keeps the volume, the grid above it that joins both interfaces, the
     number of pieces that do not, and their volume, m3."""
-    field, target = _field(domain), domain.volume
-    best: tuple[float, float, Any, Any] | None = None
-    # Levels that enclose too much and too little, and by how much; halves where it stays the same.
-    low, high = 0.0, BELOW * float(field.values.max())
-    more, less, last = float(domain.sizes.sum()) - target, -target, 0.0
-    for _ in range(HALVINGS):
-        level = high - (high - low) * min(max(less / (less - more), 0.1), 0.9)
+    field, target, tried = _field(domain), domain.volume, list[tuple[float, float, Any, Any]]()
+
+    def excess(level: float) -> float:
         whole = field.above(level)
         joined = _joined(whole)
         off = (0.0 if joined is None else outside(joined)[0].volume) - target
-        if joined is not None and (best is None or abs(off) < best[0]):
-            best = abs(off), level, whole, joined
-        if abs(off) <= NEAR * target:
-            break
-        if off > 0.0:
-            low, more = level, off
-            less *= 0.5 if last > 0.0 else 1.0
-        else:
-            high, less = level, off
-            more *= 0.5 if last < 0.0 else 1.0
-        last = off
-    if best is None:
+        if joined is not None:
+            tried.append((abs(off), level, whole, joined))
+        return 0.0 if abs(off) <= NEAR * target else off
+
+    with suppress(ValueError):  # whatever the level the volume is too large, or too small
+        brentq(excess, APART, BELOW * float(field.values.max()), xtol=FINE)
+    if not tried:
         raise InputError(
             f"arm {domain.name!r}: its design does not hang together: no material joins both "
             "interfaces; optimise longer, or with a larger design.volume_fraction"
         )
-    _, level, whole, joined = best
+    _, level, whole, joined = min(tried, key=lambda one: one[0])
     count = _number_of_pieces(whole) - _number_of_pieces(joined)
     lost = outside(whole)[0].volume - outside(joined)[0].volume if count else 0.0
     return level, joined, count, lost
@@ -617,17 +587,8 @@ def _among(points: np.ndarray, some: np.ndarray) -> np.ndarray:
 
 def _regions(solid: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return which piece of a grid its points and its cells belong to."""
-    import scipy.sparse as sp
-    from scipy.sparse.csgraph import connected_components
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    first = vtk_to_numpy(solid.GetCells().GetOffsetsArray())
-    cells = np.repeat(np.arange(solid.n_cells), np.diff(first))
-    size = solid.n_cells + solid.n_points
-    ends = cells, solid.n_cells + solid.cell_connectivity
-    graph = sp.csr_matrix((np.ones(len(cells)), ends), shape=(size, size))
-    pieces = connected_components(graph, directed=False)[1]
-    return pieces[solid.n_cells :], pieces[: solid.n_cells]
+    found = solid.connectivity()
+    return np.asarray(found.point_data["RegionId"]), np.asarray(found.cell_data["RegionId"])
 
 
 def _number_of_pieces(solid: Any) -> int:
