@@ -157,7 +157,13 @@ def draw(
 ) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.output.design import designed
-    from dolfinopt.plots.curves import deviation_of, drives_figure, history_of, limits_figure
+    from dolfinopt.plots.curves import (
+        deviation_of,
+        drives_figure,
+        history_of,
+        law_figure,
+        limits_figure,
+    )
     from dolfinopt.plots.design import design_figure, stress_figure
     from dolfinopt.plots.machine import machine_figure
     from dolfinopt.plots.style import save
@@ -177,6 +183,8 @@ def draw(
         save(deviation_of(trajectory, initial), folder / "deviation.png")
     if trajectory.is_machine:
         save(drives_figure(trajectory), folder / "drives.png")
+    if scene.motion.coefficients:
+        save(law_figure(scene), folder / "law.png")
     if animation:
         from dolfinopt.plots.animation import draw_motion
 

@@ -243,6 +243,8 @@ class _Run:
         final = assess(self.evaluator, x_phys, one.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
+        if self.evaluator.scene.horizon != self.scene.horizon:
+            self.initial_deviation = np.empty((0, 2))  # of another time
         kept = one.problem.excess == 0.0
         best = one.best.iteration
         returned = "" if best in (-1, one.iteration) else f"returned: iteration {best}"

@@ -37,6 +37,7 @@ RUN_FILES = (
     "limits.png",
     "deviation.png",
     "drives.png",
+    "law.png",
     "motion.gif",
     "machine.png",
     "stress.png",

@@ -29,6 +29,7 @@ from dolfinopt.plots.style import (
     spread,
 )
 from dolfinopt.responses.response import constraints_of, find_limited
+from dolfinopt.scene.duration import path_length, time_law
 from dolfinopt.scene.tables.responses import DECLARED, VOLUME
 
 if TYPE_CHECKING:
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
 
     from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.part.check import Check
-    from dolfinopt.scene.load import Scene
+    from dolfinopt.scene.duration import path_length, time_law
+from dolfinopt.scene.load import Scene
 
 DEVIATION = "Deviation of the end-effector from the rigid path"
 LIMIT = "0.35"  # colour of limits
@@ -267,7 +269,7 @@ def deviation_figure(
     figure = new_figure(9.0, 5.0, 120, laid_out=False)
     axes = figure.add_axes((0.1, 0.11, 0.88, 0.81))  # room for ticks such as 0.00025
     curves = [("", t, deviation)]
-    if initial is not None:
+    if initial is not None and len(initial):
         times = np.linspace(t[0], t[-1], len(initial))
         curves = [(INITIAL, times, initial), (OPTIMISED, t, deviation)]
     distances = [MILLI * lengths(vectors) for _, _, vectors in curves]
@@ -342,6 +344,7 @@ def _over_time(
 # -- drives ----------------------------------------------------------------------------------
 
 # Unit of a quantity, its factors in the order of their size: largest value below which each serves.
+LAW_INSTANTS = 401
 SCALES = {
     "m": ((1e-3, 1e6, "µm"), (1.0, 1e3, "mm"), (np.inf, 1.0, "m")),
     "rad": ((0.1, 1e3, "mrad"), (np.inf, 1.0, "rad")),
@@ -403,6 +406,31 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
         row = [(f"{name}: {words[unit]}", unit, {"": size}) for unit, size in sizes.items()]
         rows += [row] if name not in scene.driven else []  # a driven rod's is its drive's
     return rows
+
+
+# -- the law of the motion -----------------------------------------------------------------------
+
+
+def law_figure(scene: Scene) -> Figure:
+    """Return the picture of a designed law: way, speed and acceleration, with those before."""
+    motion = scene.motion
+    plain = motion.unchecked_copy({"shape": 0})
+    figure, grid = panel_grid(np.ones((3, 1), dtype=bool), "Law along the path", "time [s]")
+    t = np.linspace(0.0, motion.duration, LAW_INSTANTS)
+    length = 1.0 if motion.path == "rotation" else path_length(motion)
+    units = ("-", "1/s", "1/s2") if motion.path == "rotation" else ("m", "m/s", "m/s2")
+    laws = {"designed": time_law(motion), motion.law: time_law(plain)}
+    values = {name: law(t, motion.duration) for name, law in laws.items()}
+    for k, (axes, word) in enumerate(
+        zip(grid[:, 0], ("way", "speed", "acceleration"), strict=True)
+    ):
+        for (name, one), colour in zip(values.items(), (BLUE, ORANGE), strict=False):
+            axes.plot(t, length * one[k], color=colour, lw=LINE_WIDTH, label=name)
+        axes.set_xlim(t[0], t[-1])
+        largest = length * np.abs(values["designed"][k]).max()
+        _head(axes, f"{word} [{units[k]}]", f"largest {largest:.3g}")
+    grid[0, 0].legend(loc="best", frameon=False, fontsize=9)
+    return figure
 
 
 # -- limits by the columns of the history, and over time ----------------------------------------
