@@ -31,7 +31,8 @@ HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, step
 ACTIVE = 0.01  # of all multipliers of places: that of one whose row is found anew in each step
 ATTEMPTS = 3  # at a step of one radius
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
-DEAR, RESTORING = 50.0, 3  # price of limits that shall be met above all; steps to that, at most
+# Price of limits that shall be met above all; steps to that, at most; trust region of the first.
+DEAR, RESTORING, NEARBY = 50.0, 3, 0.05
 FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
 ENDS = 1.5  # of the way of a side's end, that a corner may go in a step
 # Of the box of a variable: after a step in the direction of the one before, in the other; bounds.
@@ -166,6 +167,7 @@ class Search:
         """Take a few steps that meet the limits above all; as many as that needs."""
         if self.since >= FOLLOWED:
             self._mesh_anew()
+        self.radius = NEARBY  # what the finer mesh says holds nearby
         for _ in range(RESTORING):
             self.price = DEAR
             if self.state.values[1:].max(initial=0.0) <= EXCESS or not self._step():
