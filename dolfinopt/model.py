@@ -58,7 +58,7 @@ from dolfinopt.responses.evaluation import constraint_gradients, evaluate, gradi
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
-from dolfinopt.scene.law_variables import law_values, with_law
+from dolfinopt.scene.law_variables import LAW, law_values, with_law
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.objective import GradientKind
 from dolfinopt.scene.toml import toml_value
@@ -415,7 +415,9 @@ class Model:
         if needs(scene, "motion"):
             choose_coordinates(scene, partition, arms, x_phys, self._profile)
         _, trajectory = evaluate(scene, partition, arms, x_phys, self._profile, simulated=False)
-        return self._gathered(gradient(scene, partition, arms, trajectory, self._profile))
+        zero = {k: np.zeros_like(x_phys[k]) for k in arms}
+        found = gradient(scene, partition, arms, trajectory, self._profile)
+        return self._gathered(zero | found)
 
     def evaluate(self, x: Design = None) -> Responses:
         """Return objective and limits of a design with their gradients, for a loop of one's own.
@@ -733,9 +735,14 @@ class Model:
     def _gathered(
         self, cells: Mapping[int, np.ndarray], partition: Partition | None = None
     ) -> dict[str, np.ndarray]:
-        """Return whole arrays by the arms' names on the root, empty elsewhere (collective)."""
-        whole = gather_cells(partition or self._arms()[0], cells)
-        return {self.scene.arms[k].name: one[self._order[k]] for k, one in whole.items()}
+        """Return whole arrays by the arms' names on the root, empty elsewhere (collective).
+
+        Derivatives by the variables of the motion's law are called "motion".
+        """
+        of_arms = {k: one for k, one in cells.items() if k != LAW}
+        whole = gather_cells(partition or self._arms()[0], of_arms)
+        found = {self.scene.arms[k].name: one[self._order[k]] for k, one in whole.items()}
+        return found | {"motion": cells[LAW]} if whole and LAW in cells else found
 
     @contextmanager
     def _folder(self, folder: str | Path | None) -> Iterator[Path]:

@@ -133,3 +133,10 @@ def test_rates_along_the_path() -> None:
         a, b = (smooth_of(chain.tried(x + sign * step)[-1].evaluation) for sign in (1.0, -1.0))
         expected = (a - b) / 2e-5 / np.array(here.evaluation.smooth_limits)
         assert here.constraints[-3:, k] == pytest.approx(expected[-3:], rel=1e-6, abs=1e-8)
+
+
+def test_model_names_the_derivatives_by_the_law() -> None:
+    one = quick("objective.kind=duration", "objective.gradient=exact", "motion.shape=1")
+    found = do.Model(one).gradient()
+    assert sorted(found) == ["arm1", "arm2", "motion"]
+    assert found["motion"].tolist() == [0.0, 1.0] and not found["arm1"].any()
