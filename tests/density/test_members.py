@@ -241,7 +241,8 @@ def test_a_gap_of_its_own_widens_the_gaps():
             assert member.size >= 0.01 - cell
             gaps.append(0.06 if found is None else found.size)  # none is narrower than the arm
     if WORLD.rank == 0:
-        assert gaps[1] >= 0.02 - cell
+        # Where a slot meets the outboard interface it is a cell narrower at either side.
+        assert gaps[1] >= 0.02 - 2.0 * cell * (1.0 + 1e-9)
 
 
 @pytest.mark.parametrize("width", [0.012, 0.0])
