@@ -16,6 +16,8 @@ from dolfinopt.optimization.gradient_check import held_steps
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 
+pytestmark = pytest.mark.serial  # commands run in this process
+
 LIMITS = "constraints.deviation=0.012", "constraints.settling=5e-4"
 DURATION = "objective.kind=duration", "objective.gradient=exact", "motion.shape=2", *LIMITS
 

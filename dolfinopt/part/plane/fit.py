@@ -43,7 +43,7 @@ MIDDLE = 0.7  # share of a portion that its line is fitted to
 LEAST = 0.3  # length of a side that is worth drawing, cells
 SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
-ATTEMPTS, COARSER = (1.0, 0.6, 0.35), (0.2, 2.0)  # shares of the tolerance, tried in turn
+ATTEMPTS, COARSER = (1.0, 0.6, 0.35), (0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
 SAME_AREA = 1e-3  # relative
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
@@ -171,9 +171,10 @@ def _rings(outline: Outline) -> Iterator[np.ndarray]:
                 yield points
 
 
-def _runs(points: np.ndarray, lines: Sequence[Any], chord: float) -> list[Run]:
+def _runs(points: np.ndarray, lines: Sequence[Any], chord: float, tolerance: float) -> list[Run]:
     """Cut a closed polygon where it comes to another curve."""
     on = _owners(points, lines, 3.0 * chord)
+    on = _without_specks(points, on, tolerance)
     return [
         Run(points[np.append(block, block[-1] + 1) % len(points)], int(on[block[0]]))
         for block in _blocks(on)
@@ -205,6 +206,17 @@ def _blocks(on: np.ndarray) -> list[np.ndarray]:
     return [np.arange(a, b) % len(on) for a, b in zip(starts, ends, strict=True)]
 
 
+def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarray:
+    """Make blocks on curves that are shorter than `size` free where both neighbours are."""
+    step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    blocks = _blocks(on)
+    for k, block in enumerate(blocks):
+        before, after = on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]
+        if len(blocks) > 1 and before == after == -1 and step[block].sum() < size:
+            on[block] = -1
+    return on
+
+
 # -- loops of sides -------------------------------------------------------------------------------
 
 
@@ -231,7 +243,7 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
     circles: list[Circle] = []
     fixed: list[tuple[Piece, ...]] = []
     for ring in _rings(outline):
-        runs = _runs(ring, lines, outline.chord)
+        runs = _runs(ring, lines, outline.chord, tolerance)
         for chain, halved in _chains(runs, len(edges) if domain.symmetric else -2):
             if _hole_area(chain, halved) < hole:
                 continue
