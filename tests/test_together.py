@@ -196,7 +196,7 @@ def writing_gradients(folder):
 def reading_designs(folder):
     built = build(*COARSE)
     found = do.gather_views(*built.place, built.uniform())
-    by_root(lambda: design.write_design(folder, found))
+    by_root(lambda: design.write_design(folder, found, built.place[0]))
     return lambda: design.read_design(folder / "design.npz", built.partition, built.arms)
 
 
