@@ -110,6 +110,7 @@ def test_run_is_resumed_in_the_same_bits_and_its_design_read_with_its_law(tmp_pa
         (["feed_forward.kind=tip"], "feed_forward.kind"),
         (["objective.gradient=esl"], "objective.gradient"),
         (["motion.max_speed=30"], "constraints.path_speed"),
+        ([f"motion.shape={[0.01] * 9}"], "at most 8 coefficients"),
     ],
 )
 def test_what_a_designed_law_cannot_be_combined_with(changes: list[str], words: str) -> None:

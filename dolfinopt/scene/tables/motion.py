@@ -33,7 +33,8 @@ Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
 Gravity = tuple[Acceleration, Acceleration] | tuple[Acceleration, Acceleration, Acceleration]
 Instant = Annotated[float, Field(ge=0, le=1e5)]  # s
 SHAPE_LIMIT = 0.2  # of coefficients: shares of the way by which a law may run ahead
-ShapeCount = Annotated[int, Field(ge=0, le=8)]
+MOST_COEFFICIENTS = 8
+ShapeCount = Annotated[int, Field(ge=0, le=MOST_COEFFICIENTS)]
 Coefficient = Annotated[float, Field(ge=-SHAPE_LIMIT, le=SHAPE_LIMIT)]
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 LIMITS = ("max_speed", "max_acceleration", "max_jerk")
@@ -329,6 +330,8 @@ class Motion(Table):
     def _check_designed_law(self, scene: Scene) -> None:
         """Refuse what a law with variables cannot be combined with."""
         key = ("motion", "shape") if self.coefficients else ("objective", "kind")
+        if len(self.coefficients) > MOST_COEFFICIENTS:
+            raise Refusal(f"expected at most {MOST_COEFFICIENTS} coefficients", ("motion", "shape"))
         rates = any(one in scene.constraints.limits for one in OF_PATH)
         if self.path in ("points", "joints") or (rates and self.path == "rotation"):
             raise Refusal(
