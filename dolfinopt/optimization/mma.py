@@ -86,9 +86,7 @@ def mma_step(
     state: MMAState,
     *,
     move: float = 0.2,
-    first: float = FIRST_ASYMPTOTE_DISTANCE,
     widest: float = _FARTHEST,
-    prices: npt.ArrayLike | None = None,
 ) -> tuple[Array, MMAState]:
     """Minimise Svanberg's convex approximation of min f0(x), f_i(x) <= 0, xmin <= x <= xmax.
 
@@ -106,11 +104,8 @@ def mma_step(
         xmin, xmax: (n,) or scalar bounds; a variable with xmin == xmax stays.
         state: what the step before returned, or `initial_state(x)`.
         move: largest step of a variable, in units of its range.
-        first, widest: distance of the asymptotes in the first two steps, and the largest one, in
-            these units. Wide ones make the approximation nearly linear, which lets curved
-            constraints be left again and again.
-        prices: (m,) of a unit of every f_i, in units of f0: with them the approximation is that of
-            f0 + sum_i price_i max(0, f_i). By default c_i = 1000.
+        widest: largest distance of the asymptotes, in these units. Wide ones make the
+            approximation nearly linear, which lets curved constraints be left again and again.
 
     Returns:
         The new design (n,) and the state for the next step; both are new arrays.
@@ -127,7 +122,7 @@ def mma_step(
         gradients = np.vstack((df0dx, dfdx)) * (high - low)
     _check(x, low, high, f, gradients)
     width = np.where(high > low, high - low, 1.0)  # passive: no gradient and no room, any unit does
-    distance = _asymptote_distances(x, width, state, first, widest)
+    distance = _asymptote_distances(x, width, state, widest)
     step = np.minimum(_LARGEST_STEP, move / distance)
     s_min = -np.minimum(step, (x - low) / (distance * width))
     s_max = np.minimum(step, (high - x) / (distance * width))
@@ -137,16 +132,12 @@ def mma_step(
     scale = np.where(largest > 0.0, largest, 1.0)[used]
     G = distance * gradients[used] / scale[:, None]
     H = _CURVATURE * np.abs(G) + 2.0 * _RAA0 * distance
-    cost = np.full(f.size, _PENALTY)[felt]
-    if prices is not None:
-        dear = np.asarray(prices, dtype=np.float64)[felt] * scale[1:] / scale[0]
-        cost = np.maximum(dear, _RAA0)
     # Nothing reaches beyond 1e30 normalised gradients: the limit only avoids overflow.
     with np.errstate(over="ignore"):
         normalised = np.clip(f[felt] / scale[1:], -1e30, 1e30)
     known = state.multipliers if state.multipliers.shape == f.shape else np.ones(f.size)
-    dual = _Dual(G, H, s_min, s_max, normalised, cost)
-    point = _solve_dual(dual, np.minimum(known[felt], cost))
+    dual = _Dual(G, H, s_min, s_max, normalised)
+    point = _solve_dual(dual, np.minimum(known[felt], _PENALTY))
     multipliers = np.zeros(f.size)
     multipliers[felt] = point.multipliers
     distance = distance * width
@@ -168,12 +159,10 @@ def _check(x: Array, low: Array, high: Array, f: Array, gradients: Array) -> Non
         raise ValueError("MMA: x is not between its bounds")
 
 
-def _asymptote_distances(
-    x: Array, width: Array, state: MMAState, first: float, widest: float
-) -> Array:
+def _asymptote_distances(x: Array, width: Array, state: MMAState, widest: float) -> Array:
     """Return the distances of the asymptotes from x in units of the ranges `width`."""
     if state.iteration < 2:
-        return np.full(width.shape, first)
+        return np.full(width.shape, FIRST_ASYMPTOTE_DISTANCE)
     last, before = (x - state.x_old1) / width, (state.x_old1 - state.x_old2) / width
     moving = np.minimum(np.abs(last), np.abs(before)) > REST_MOVE_SHARE
     factor = np.where(moving, np.where((last > 0.0) == (before > 0.0), _WIDEN, _NARROW), 1.0)
@@ -194,7 +183,7 @@ class _DualPoint:
 
 @dataclass(frozen=True, eq=False)
 class _Dual:
-    """The concave dual function of the subproblem, over multipliers from 0 to their prices.
+    """The concave dual function of the subproblem, over multipliers from 0 to `_PENALTY`.
 
     W(l) = sum_j min_s (G_j s + H_j s^2) / (1 - s^2) + l.f with G_j = G_0j + sum_i l_i G_ij and H_j
     likewise. The inner minimum is at s = -G / (H + sqrt(H^2 - G^2)), cut off at the bounds of s.
@@ -202,7 +191,7 @@ class _Dual:
     Attributes:
         G, H: (1 + m, n).
         s_min, s_max: (n,) bounds.
-        f, prices: (m,) values of the constraints, and what a unit of their violation costs.
+        f: (m,) values of the constraints.
     """
 
     G: Array
@@ -210,7 +199,6 @@ class _Dual:
     s_min: Array
     s_max: Array
     f: Array
-    prices: Array
 
     def at(self, multipliers: Array) -> _DualPoint:
         """Evaluate the dual function at multipliers (m,)."""
@@ -253,7 +241,7 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
     if not multipliers.size:
         return point
     for _ in range(DUAL_EVALUATIONS):
-        new = _newton_step(point, radius, dual.prices)
+        new = _newton_step(point, radius)
         change = new - point.multipliers
         relative = np.abs(change) / (point.multipliers + _RAA0)
         if relative.max() <= ROUNDING:
@@ -278,7 +266,7 @@ def _solve_dual(dual: _Dual, multipliers: Array) -> _DualPoint:
     )
 
 
-def _newton_step(point: _DualPoint, radius: Array, prices: Array) -> Array:
+def _newton_step(point: _DualPoint, radius: Array) -> Array:
     """Return the multipliers that maximise the dual's quadratic model near the point.
 
     Near: each grows or shrinks by the factor 1 + radius at most, in units of it and a floor.
@@ -286,12 +274,12 @@ def _newton_step(point: _DualPoint, radius: Array, prices: Array) -> Array:
     old = point.multipliers
     unit = old + _RAA0
     lower = np.maximum(-old / unit, -radius / (1.0 + radius))
-    upper = np.minimum((prices - old) / unit, radius)
+    upper = np.minimum((_PENALTY - old) / unit, radius)
     curvature = point.curvature * np.outer(unit, unit)
     z = _maximise_in_box(point.gradient * unit, curvature, lower, upper)
-    new = np.clip(old + unit * z, 0.0, prices)
+    new = np.clip(old + unit * z, 0.0, _PENALTY)
     new[z <= -old / unit] = 0.0
-    return np.asarray(np.where(z >= (prices - old) / unit, prices, new))
+    return np.asarray(np.where(z >= (_PENALTY - old) / unit, _PENALTY, new))
 
 
 def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Array) -> Array:

@@ -178,7 +178,7 @@ class MotionResponse(Response):
         seen = self.seen(trajectory)
         return self.value_at(seen, self.load_cases(seen))
 
-    def combine(self, scene: Scene, values: Sequence[float]) -> tuple[float, list[float]]:
+    def combine(self, scene: Scene, values: Sequence[float]) -> tuple[float, np.ndarray]:
         """Return the value of all scenarios from their own, and its derivatives by them."""
         if self.limited:
             return worst_of(values, self.options.exponent)
@@ -229,7 +229,7 @@ class MotionResponse(Response):
             own = {k: exact_gradient(one, by[k], by=analysis.by) for k, one in designs.items()}
         return own | {LAW: by[LAW]} if LAW in by else own
 
-    def _weights_of_scenarios(self, trajectory: Trajectory) -> list[float]:
+    def _weights_of_scenarios(self, trajectory: Trajectory) -> np.ndarray:
         """Return the derivatives of the value by those of `motions_of`."""
         values = [self.of_motion(one) for one in motions_of(trajectory)]
         return self.combine(trajectory.scene, values)[1]
@@ -253,7 +253,7 @@ def motions_of(trajectory: Trajectory) -> tuple[Trajectory, ...]:
 def over_motions(
     analysis: Analysis,
     of_motion: Callable[[int, Trajectory], Followed | None],
-    weights: Sequence[float] = (),
+    weights: np.ndarray | None = None,
 ) -> dict[int, Any]:
     """Differentiate a weighted sum over all motions by the bodies of every design (on the root).
 
@@ -276,7 +276,7 @@ def over_motions(
         if found is None:
             continue
         profile.counts.adjoints += 1
-        weight = weights[number] if weights else 1.0
+        weight = 1.0 if weights is None else weights[number]
         if one.feed_forward is not nominal:
             found = Followed(found.through(one.feed_forward))
         if found.by_coefficients is not None:

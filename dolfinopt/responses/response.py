@@ -363,8 +363,8 @@ def cotangents_of_scene(cotangents: ShapeIntegrals, f: Factors, weight: float) -
 
 
 def worst_of(
-    values: Sequence[float], exponent: float, least: bool = False
-) -> tuple[float, list[float]]:
+    values: Sequence[float] | np.ndarray, exponent: float, least: bool = False
+) -> tuple[float, np.ndarray]:
     """Return (sum f^p)^(1/p) of positive values and its derivatives; a single value is itself.
 
     With `least` the smallest one made smooth, (sum f^-p)^(-1/p).
@@ -373,26 +373,24 @@ def worst_of(
     Kreisselmeier and Steinhauser's function of the logarithms.
     Source: Kreisselmeier & Steinhauser (1979), doi:10.1016/S1474-6670(17)65584-8.
     """
-    if len(values) == 1:
-        return values[0], [1.0]
-    worst, by_values = p_norm(np.array(values), -exponent if least else exponent)
-    return worst, list(map(float, by_values))
+    if len(values) == 1:  # of either sign, or none
+        return float(values[0]), np.ones(1)
+    return p_norm(np.asarray(values), -exponent if least else exponent)
 
 
 def combined(
     scene: Scene, values: Sequence[float], least: bool = False
-) -> tuple[float, list[float]]:
+) -> tuple[float, np.ndarray]:
     """Return the objective of all scenarios from their own, and its derivatives.
 
     "sum": sum w f. "worst": the smooth largest of w f, with `objective.exponent`; or with `least`,
     of what is maximised, the smooth smallest.
     """
-    weights = [one.weight for one in scene.scenarios] or [1.0]
+    weights = np.array([one.weight for one in scene.scenarios] or [1.0])
     if scene.objective.scenarios == "sum":
-        return sum(w * f for w, f in zip(weights, values, strict=True)), weights
-    scaled_values = [w * f for w, f in zip(weights, values, strict=True)]
-    worst, by_values = worst_of(scaled_values, scene.objective.exponent, least)
-    return worst, [s * w for s, w in zip(by_values, weights, strict=True)]
+        return float(weights @ values), weights
+    worst, by_values = worst_of(weights * values, scene.objective.exponent, least)
+    return worst, weights * by_values
 
 
 # -- the p-norm: the largest of several values, made smooth --------------------------------------

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -202,7 +201,7 @@ COMPARED = [  # problem and start, bounds, steps, move, and how far designs may 
 def test_steps_agree_with_mmapy(posed, bounds, steps, move, close, monkeypatch):
     # Svanberg counts every move, however small, and begins with asymptotes half a range away.
     monkeypatch.setattr(mma, "REST_MOVE_SHARE", 1e-9)
-    monkeypatch.setitem(globals(), "mma_step", partial(mma_step, first=0.5))
+    monkeypatch.setattr(mma, "FIRST_ASYMPTOTE_DISTANCE", 0.5)
     problem, x = posed
     lo, hi = (np.full(x.size, bound) for bound in bounds)
     design, asymptotes = largest_difference_from_mmapy(problem, x, lo, hi, steps, move)

@@ -194,8 +194,9 @@ def test_the_least_made_smooth() -> None:
             for s in (1.0, -1.0)
         )
         assert slopes[k] == pytest.approx((there - back) / 2e-6, rel=1e-6)
-    assert worst_of([3.0], 20.0, least=True) == (3.0, [1.0])
-    assert worst_of([3.0, 0.0], 20.0, least=True) == (0.0, [0.0, 0.0])
+    for values, least, slopes in (([3.0], 3.0, [1.0]), ([3.0, 0.0], 0.0, [0.0, 0.0])):
+        value, by_values = worst_of(values, 20.0, least=True)
+        assert value == least and list(by_values) == slopes
 
 
 @pytest.mark.parametrize("name", objective_kinds())
