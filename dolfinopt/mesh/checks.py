@@ -117,9 +117,10 @@ def check_cells(points: np.ndarray, cells: np.ndarray) -> None:
     if cells.shape[1] == 2**dim:
         _refuse(_folded(corners, tiny), corners, "are folded")
     _refuse(cell_sizes(corners) < tiny, corners, "are flat")
-    bad = _overlapping(corners, facet_keys(cells, dim))
+    keys = facet_keys(cells, dim)
+    bad = _overlapping(corners, keys)
     if dim == 2 and not bad.any():
-        bad = _covered(corners)
+        bad = _covered(corners, keys)
     kind, shared = ("surfaces", "curves") if dim == 2 else ("volumes", "faces")
     _refuse(bad, corners, f"overlap others (inverted cells, or {kind} on top of each other)")
     starts = cells.shape[1] * np.arange(len(cells) + 1)
@@ -158,25 +159,26 @@ def _folded(corners: np.ndarray, tiny: np.ndarray) -> np.ndarray:
     return found
 
 
-def _covered(corners: np.ndarray) -> np.ndarray:
+def _covered(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
     """Return (n,) True for convex cells with a place of theirs in one of the cells near it.
 
-    Places are the centre, and points near the corners.
+    Places are the centre, and points near the corners; of cells at an edge, which parts that lie
+    on top of each other have there.
     """
-    centre = corners.mean(axis=1)
-    places = [centre, *(0.9 * corner + 0.1 * centre for corner in corners.swapaxes(0, 1))]
+    centre, (_, inverse, counts) = corners.mean(axis=1), np.unique(keys, False, True, True)
+    here = np.flatnonzero((counts[inverse].reshape(keys.shape) == 1).any(axis=0))
+    places = 0.9 * np.concatenate([corners, centre[:, None]], axis=1) + 0.1 * centre[:, None]
     sides = facet_corners(corners.shape[2], corners.shape[1])
     planes = [inward_normal(corners, side) for side in sides]
-    covered, here = np.zeros(len(centre), dtype=bool), np.arange(len(centre))
-    tree = cKDTree(centre)
-    for place in places:
-        near = tree.query(place, k=min(9, len(centre)))[1].reshape(len(centre), -1)
+    covered, tree = np.zeros(len(centre), dtype=bool), cKDTree(centre)
+    for place in places[here].swapaxes(0, 1):
+        near = tree.query(place, k=min(9, len(centre)))[1].reshape(len(here), -1)
         for other in near.T:
             inside = other != here
             for origin, normal in planes:
                 height = np.einsum("ni,ni->n", normal[other], place - origin[other])
                 inside &= height > 0.0
-            covered |= inside
+            covered[here] |= inside
     return covered
 
 
