@@ -155,8 +155,7 @@ def _folded(corners: np.ndarray, tiny: np.ndarray) -> np.ndarray:
     grid = corners.reshape(-1, *dim * (2,), dim)  # z, y, x
     edges = [np.broadcast_to(np.diff(grid, axis=axis), grid.shape) for axis in range(dim, 0, -1)]
     turn = np.linalg.det(np.stack(edges, axis=-1)).reshape(len(corners), -1)
-    found: np.ndarray = (turn.min(axis=1) < -tiny) & (turn.max(axis=1) > tiny)
-    return found
+    return np.asarray((turn.min(axis=1) < -tiny) & (turn.max(axis=1) > tiny))
 
 
 def _covered(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
