@@ -366,9 +366,9 @@ class Arm:
     def initial_vectors(self, vectors: Sequence[np.ndarray]) -> None:
         self.initial.basis = vectors[0] if vectors[0].shape[1] else None
         self.initial.loaded.clear()
-        for place, one in zip(self.places, vectors[1:], strict=True):
-            if one.shape[1]:
-                self.initial.loaded[place] = one
+        for place, vector in zip(self.places, vectors[1:], strict=True):
+            if vector.shape[1]:
+                self.initial.loaded[place] = vector
 
     def forget(self) -> None:
         """Let the next design owe nothing to earlier ones: initial vectors, stiffening."""
@@ -501,7 +501,9 @@ def fixed_body(scene: scenes.Scene, index: int) -> ShapeIntegrals:
     arm = scene.arms[index]
     if arm.sid is not None:
         changed = os.stat(arm.sid).st_mtime_ns
-        interfaces = tuple((one.name, one.point) for one in arm.further_interfaces)
+        interfaces = tuple(
+            (interface.name, interface.point) for interface in arm.further_interfaces
+        )
         body = _read_body(arm.sid, changed, scene.dimension, arm.length, interfaces)
         if not body.is_stiffened or scene.simulation.stiffening is not False:
             return body

@@ -142,14 +142,14 @@ class FrozenTree:
 
     def _beyond(self, body: int, interface: int) -> list[tuple[int, np.ndarray]]:
         """Return the bodies outboard of an interface, and their motion by that of it."""
-        found: list[tuple[int, np.ndarray]] = []
+        result: list[tuple[int, np.ndarray]] = []
         for i in self.mechanism.hanging.get((body, interface), ()):
             own = self._steps[i]
-            found.append((i, own))
+            result.append((i, own))
             for s in self.mechanism.sites[i]:
                 shift = self._shift(i, s) @ own
-                found += [(j, T @ shift) for j, T in self._beyond(i, s)]
-        return found
+                result += [(j, T @ shift) for j, T in self._beyond(i, s)]
+        return result
 
     def _loads_beyond(self, body: int, interface: int) -> Iterator[np.ndarray]:
         """Yield the inertia (b, b) of all loads and rotors at an interface and outboard of it."""
@@ -170,7 +170,7 @@ class FrozenTree:
 
         Matrices (n b, n b) under displacements and rotations of its n interfaces; kg, kg m, kg m2.
         """
-        found = []
+        result = []
         for k, body in enumerate(self.mechanism.bodies):
             whole = np.zeros(2 * (len(body.outboard),))
             for s in self.mechanism.sites[k]:
@@ -179,8 +179,8 @@ class FrozenTree:
                     M += T.T @ mass_matrix(self.mechanism.bodies[i]) @ T
                 place = self._place(s)
                 whole[place, place] = self._kept(M)
-            found.append(whole)
-        return found
+            result.append(whole)
+        return result
 
     def _place(self, interface: int) -> slice:
         b = self.mechanism.dim.b

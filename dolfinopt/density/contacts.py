@@ -72,18 +72,18 @@ def contacts_of(
         corners[at].reshape(-1, corners.shape[2]), axis=0, return_inverse=True
     )
     nodes = nodes.reshape(at.size, -1)
-    at, nodes = (one[np.lexsort(np.sort(nodes, axis=1).T)] for one in (at, nodes))
+    at, nodes = (item[np.lexsort(np.sort(nodes, axis=1).T)] for item in (at, nodes))
     mesh = _Solid(points, nodes, held[at], volume[at])
     corner, edge = mesh.contacts(mesh.every)
     kept, joins = mesh.opened()
-    found = np.zeros_like(solid)
-    found[at[kept]] = True
+    result = np.zeros_like(solid)
+    result[at[kept]] = True
     return Contacts(
         pieces=len(np.unique(mesh.pieces(mesh.every))),
         corners=len(corner),
         edges=len(edge),
         places=mesh.worst([*edge, *corner]),
-        kept=found,
+        kept=result,
         left_out=1.0 - float(mesh.volume[kept].sum() / mesh.volume.sum()),
         remaining=sum(map(len, mesh.contacts(kept))),
         joins=joins,
@@ -140,8 +140,8 @@ class _Solid:
         """Return the cells (n,) that are kept, and whether they join all interfaces."""
         kept, joins = self._joined(self.every)
         for _ in range(ROUNDS):
-            before, found = kept.copy(), [one for kind in self.contacts(kept) for one in kind]
-            for groups in found if len(found) <= MANY else ():
+            before, result = kept.copy(), [item for kind in self.contacts(kept) for item in kind]
+            for groups in result if len(result) <= MANY else ():
                 groups = [group[kept[group]] for group in groups]
                 # The largest group stays; of groups of one size the one that the rest needs.
                 order = sorted(groups, key=lambda group: (len(group), -self._free(group, kept)))
@@ -216,11 +216,11 @@ def _split(keys: np.ndarray, kept: np.ndarray, pairs: np.ndarray) -> dict[int, l
     cells, values, groups = cells[order], values[order], groups[order]
     starts = np.flatnonzero(np.diff(values, prepend=-1))
     bounds = np.append(starts, len(values))
-    found: dict[int, list[np.ndarray]] = {}
+    result: dict[int, list[np.ndarray]] = {}
     jumps = (np.diff(groups) != 0) & (np.diff(values) == 0)
     for key in np.unique(values[1:][jumps]):
         at = np.searchsorted(values[starts], key)
         part = slice(bounds[at], bounds[at + 1])
         cuts = np.flatnonzero(np.diff(groups[part])) + 1
-        found[int(key)] = np.split(cells[part], cuts)
-    return found
+        result[int(key)] = np.split(cells[part], cuts)
+    return result

@@ -104,7 +104,7 @@ def thinnest(corners: np.ndarray, solid: np.ndarray, most: float = 0.0) -> Width
 def _samples(corners: np.ndarray, low: np.ndarray, extent: np.ndarray, h: float) -> np.ndarray:
     """Return whether a convex cell holds the middle of every sample of side h from `low` on."""
     counts = np.maximum(np.rint(extent / h).astype(int), 1)
-    found = np.zeros(counts, dtype=bool)
+    result = np.zeros(counts, dtype=bool)
     first = np.floor((corners.min(axis=1) - low) / h - 0.5).astype(int)
     last = np.ceil((corners.max(axis=1) - low) / h - 0.5).astype(int)
     d = corners.shape[2]
@@ -116,8 +116,8 @@ def _samples(corners: np.ndarray, low: np.ndarray, extent: np.ndarray, h: float)
         for origin, normal in sides:
             height = np.einsum("ni,ni->n", normal, point - origin)
             inside &= height >= -GRID_ROUNDING_SHARE * h**d
-        found[tuple(place[inside].T)] = True
-    return found
+        result[tuple(place[inside].T)] = True
+    return result
 
 
 Place = tuple[int, ...]  # of a sample
@@ -134,11 +134,11 @@ def _width(inside: np.ndarray, most: int, hinges: bool) -> tuple[int, Place]:
     place, middle = _place(int(np.argmax(depth)), depth), 1
     # From below: in space a ball much wider than a member takes it for an edge, see `THIN`.
     while high - low > 1:
-        found = _thinner(inside, depth, middle)
-        if found is None:
+        result = _thinner(inside, depth, middle)
+        if result is None:
             low, middle = middle, min(max(middle + 1, int(middle / THIN)), (middle + high) // 2)
         else:
-            high, place = middle, found
+            high, place = middle, result
             middle = (low + high) // 2
     return low, place
 

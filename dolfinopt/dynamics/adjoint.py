@@ -101,10 +101,10 @@ class Adjoint:
         """Return what `_backwards` does by one kind of matrix, or None, see `_answered`."""
         multipliers, after = np.empty_like(by_a), np.zeros_like(by_y[0])
         for part in reversed(chunks(self._stages, slow)):
-            found = _answered(*self._factorised(part, slow), by_a[part], by_y[part], after)
-            if found is None:
+            result = _answered(*self._factorised(part, slow), by_a[part], by_y[part], after)
+            if result is None:
                 return None
-            multipliers[part], after = found
+            multipliers[part], after = result
         return multipliers, after[0]
 
     def _factorised(self, part: slice, slow: np.ndarray) -> _Factors:
@@ -143,11 +143,11 @@ def _sampled(
     late = (h * tau)[:, None] * by_rates[0]
     if len(by_rates) > 1:
         late += by_rates[1]
-    found, first = np.unique(step, return_index=True)  # instants of a step lie side by side
+    result, first = np.unique(step, return_index=True)  # instants of a step lie side by side
     by_a = np.zeros_like(solution.a)
     by_y = np.zeros((len(solution.a), 2, by_rates.shape[2]))
-    by_a[found] = np.add.reduceat(by_instant, first)
-    by_y[found] = np.add.reduceat(np.stack([by_rates[0], late], axis=1), first)
+    by_a[result] = np.add.reduceat(by_instant, first)
+    by_y[result] = np.add.reduceat(np.stack([by_rates[0], late], axis=1), first)
     return by_a, by_y
 
 
@@ -162,12 +162,12 @@ def _answered(
     # Where the matrix is not the derivative, its answer to what is left is a step, and the sum of
     # steps is the one that leaves least: generalised conjugate residuals (Eisenstat, Elman &
     # Schultz 1983, doi:10.1137/0720023). None where that takes `ADJOINT_CORRECTIONS_LIMIT` steps.
-    found, stages = matrix.solve_transposed(by_a, by_y, after), matrix.stages
+    result, stages = matrix.solve_transposed(by_a, by_y, after), matrix.stages
     if exact is matrix.tangent:
-        return found, _before(stages, by_y + _gradient(stages, exact, found)[1], after)
-    enough = ROUNDING * np.abs(found).max()
-    left, by_first, rest = found, by_y, np.zeros_like(after)
-    found = np.zeros_like(left)
+        return result, _before(stages, by_y + _gradient(stages, exact, result)[1], after)
+    enough = ROUNDING * np.abs(result).max()
+    left, by_first, rest = result, by_y, np.zeros_like(after)
+    result = np.zeros_like(left)
     steps: list[tuple[np.ndarray, ...]] = []  # with what they take away, and dJ by first states
     for _ in range(ADJOINT_CORRECTIONS_LIMIT):
         more_a, more_y = _gradient(stages, exact, left)
@@ -178,10 +178,10 @@ def _answered(
         steps.append(tuple(x / np.linalg.norm(new[1]) for x in new))
         step, lost, more_y = steps[-1]
         share = np.vdot(lost, left)
-        found, left = found + share * step, left - share * lost
+        result, left = result + share * step, left - share * lost
         by_first = by_first + share * more_y
         if np.abs(left).max() <= enough:
-            return found, _before(stages, by_first, after)
+            return result, _before(stages, by_first, after)
     return None
 
 

@@ -56,10 +56,10 @@ class Budget:
     @property
     def shares(self) -> dict[str, float]:
         """Return the share of all links, and of every other kind that there is, by `KINDS`."""
-        found = {KINDS["link"]: 0.0}
-        for one in self.parts:
-            found[KINDS[one.kind]] = found.get(KINDS[one.kind], 0.0) + one.share
-        return found
+        result = {KINDS["link"]: 0.0}
+        for part in self.parts:
+            result[KINDS[part.kind]] = result.get(KINDS[part.kind], 0.0) + part.share
+        return result
 
 
 def deflection_budget(trajectory: MachineTrajectory) -> Budget | None:
@@ -79,13 +79,13 @@ def deflection_budget(trajectory: MachineTrajectory) -> Budget | None:
         return None
     seen = trajectory.at(trajectory.t[worst : worst + 1])
     by_rigid, by_q = _derivatives(seen, seen.deviation / size)
-    found = [*_elastic(seen, by_q), *_rigid(seen, by_rigid)]
-    linear = sum(deflection for _, _, deflection in found)
+    result = [*_elastic(seen, by_q), *_rigid(seen, by_rigid)]
+    linear = sum(deflection for _, _, deflection in result)
     if linear == 0.0:
         return None
     order = list(KINDS)
-    found.sort(key=lambda one: order.index(one[0]))
-    parts = tuple(Contribution(kind, name, x, x / linear) for kind, name, x in found)
+    result.sort(key=lambda item: order.index(item[0]))
+    parts = tuple(Contribution(kind, name, x, x / linear) for kind, name, x in result)
     return Budget(float(seen.t[0]), size, linear, parts)
 
 
@@ -129,10 +129,10 @@ def _gives_way(seen: MachineTrajectory) -> np.ndarray:
     problem, columns = seen.problem, seen.problem.motor_joints
     if not problem.drives.controlled:  # motors are where they are asked to be
         return np.asarray((seen.q_r - seen.desired.q)[0])
-    found = np.zeros(seen.q_r.shape[1])
+    result = np.zeros(seen.q_r.shape[1])
     if seen.motors is not None:
-        found[columns] = seen.q_r[0, columns] - seen.motors[0]
+        result[columns] = seen.q_r[0, columns] - seen.motors[0]
     winding = problem.at(seen.t).winding
     if winding is not None:
-        found[problem.drives.free] += winding[0]
-    return found
+        result[problem.drives.free] += winding[0]
+    return result

@@ -146,8 +146,8 @@ def _reversals(scene: Scene, motion: Callable[[np.ndarray], RigidMotion]) -> lis
     v = motion(t).qd * (coulomb > 0.0)
     k, joint = np.nonzero(v[:-1] * v[1:] < 0.0)
     before, after = np.abs(v[k, joint]), np.abs(v[k + 1, joint])
-    found: list[float] = (t[k] + (t[k + 1] - t[k]) * before / (before + after)).tolist()
-    return found
+    result: list[float] = (t[k] + (t[k + 1] - t[k]) * before / (before + after)).tolist()
+    return result
 
 
 def _begun_at(
@@ -182,8 +182,8 @@ def _drives(scene: Scene) -> Drives:
     free, dependent = np.zeros((2, count), dtype=bool)
     dependent[passive_coordinates(scene)] = free[passive_coordinates(scene)] = True
     soft = soft_joints(scene)
-    for k, one in soft.items():
-        free[k], stiffness[k], damping[k] = True, one.stiffness, one.damping
+    for k, item in soft.items():
+        free[k], stiffness[k], damping[k] = True, item.stiffness, item.damping
     for k, rod in enumerate(scene.rods, len(scene.movable)):
         if rod.is_spring:
             free[k], stiffness[k], damping[k] = True, rod.stiffness, rod.damping
@@ -315,11 +315,11 @@ class Trajectory(MachineTrajectory):
     def at_rest(self) -> np.ndarray:
         """Which instants are in a rest (n,); the last one is in any case."""
         rounding, t = 1e-9 * self.scene.horizon, self.t - self.scene.lead
-        found = np.zeros(len(t), dtype=bool)
+        result = np.zeros(len(t), dtype=bool)
         for begin, end in rests(self.scene):
-            found |= (t >= begin - rounding) & (t <= end + rounding)
-        found[-1] = True
-        return found
+            result |= (t >= begin - rounding) & (t <= end + rounding)
+        result[-1] = True
+        return result
 
     def under_law(self, values: np.ndarray) -> Self:
         """Return the same motion of the unknowns under another law, see `with_law`.
@@ -336,20 +336,20 @@ class Trajectory(MachineTrajectory):
     @cached_property
     def residual(self) -> np.ndarray:
         """What the equations leave at all stages (n s, S)."""
-        one = self.solution
-        t = stage_instants(one.time_grid, one.nodes)
-        rates = (one.sample(t, k) for k in range(3))
-        return self.problem.at_stages(one.time_grid, one.nodes).residual(*rates)
+        solution = self.solution
+        t = stage_instants(solution.time_grid, solution.nodes)
+        rates = (solution.sample(t, k) for k in range(3))
+        return self.problem.at_stages(solution.time_grid, solution.nodes).residual(*rates)
 
     @cached_property
     def beside(self) -> tuple[tuple[float, Self, Self], ...]:
         """A step of every variable of the law, and the motion with so much more and less of it."""
-        here, found = law_values(self.scene), []
-        for size, one in zip(np.diff(law_bounds(self.scene), axis=0)[0], np.eye(len(here))):
+        here, result = law_values(self.scene), []
+        for size, item in zip(np.diff(law_bounds(self.scene), axis=0)[0], np.eye(len(here))):
             step = LAW_DIFFERENCE * float(size)
-            sides = self.under_law(here + step * one), self.under_law(here - step * one)
-            found.append((step, *sides))
-        return tuple(found)
+            sides = self.under_law(here + step * item), self.under_law(here - step * item)
+            result.append((step, *sides))
+        return tuple(result)
 
     def by_law(self, multipliers: np.ndarray, value: Callable[[Self], float]) -> np.ndarray | None:
         """Return dJ by the variables of the law (n,), by central differences of J and residual.

@@ -162,14 +162,14 @@ def _lost(
     values, X = np.linalg.eig(method.A)
     weights = (method.A[-1] @ X) * np.linalg.solve(X, np.ones(len(values)))
     parts = (w / (1.0 - z * x) for w, x in zip(weights, values, strict=True))
-    exact, found = np.exp(z), 1.0 + z * sum(parts)
+    exact, result = np.exp(z), 1.0 + z * sum(parts)
     largest, steps = np.zeros(z.shape[1]), np.zeros(z.shape)
     for first, amplitude in zip(breakpoint_steps, amplitudes, strict=True):
         true = np.cumprod(exact[first:], axis=0)
-        apart = np.abs(true - np.cumprod(found[first:], axis=0)).max(axis=0)
+        apart = np.abs(true - np.cumprod(result[first:], axis=0)).max(axis=0)
         largest += np.square(amplitude * apart)
         begins = np.concatenate([np.ones_like(true[:1]), true[:-1]])
-        steps[first:] += np.square(amplitude * np.abs(begins * (exact - found)[first:]))
+        steps[first:] += np.square(amplitude * np.abs(begins * (exact - result)[first:]))
     return np.sqrt(largest), np.sqrt(steps)
 
 

@@ -96,7 +96,7 @@ class Splines:
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return all splines, their rates and accelerations (3, n, p) at instants t (n,), s."""
-        return np.stack([one(t) for one in self._every])
+        return np.stack([item(t) for item in self._every])
 
 
 @dataclass(frozen=True, eq=False)
@@ -384,8 +384,8 @@ class FeedForward:
                     "corrections; raise feed_forward.lead, or correct other joints"
                 )
         weights = -squares.weights * (squares.by_coefficients @ change)
-        found = self._follow(self.machine, self.solution, weights)[0]
-        return add_gradients(found, beside) if beside else found
+        result = self._follow(self.machine, self.solution, weights)[0]
+        return add_gradients(result, beside) if beside else result
 
     def _curvature(self, change: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return -S mu (p F,) and -d/d eps of the bodies' derivative, by central differences."""
@@ -602,7 +602,9 @@ def joints_of(
     J, t = tip_by_joints(machine)
     needed = min(int(np.linalg.matrix_rank(J[:, :, every]).max()), len(every))
     if asked is None:
-        joints = max(combinations(every, needed), key=lambda one: least(J, one, needed).min())
+        joints = max(
+            combinations(every, needed), key=lambda combination: least(J, combination, needed).min()
+        )
     else:
         joints = tuple(sorted(names.index(name) for name in asked))
     if len(joints) < needed:

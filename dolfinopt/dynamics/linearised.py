@@ -81,12 +81,12 @@ class Linearised:
     def constraints(self) -> np.ndarray:
         """G = dg/dy and its first and second rate along the motion (3, m, S)."""
         _, moving, last = self.system.ends
-        found = np.zeros((3, last - moving, self.system.num_coordinates))
+        result = np.zeros((3, last - moving, self.system.num_coordinates))
         if self.system.loops is not None:
             move, differentiate = self.to_rates
             G = self.loops(move @ self.motion).jacobian[:, :, self.system.columns]
-            found[:, :, :moving] = np.tensordot(differentiate, G, 1)
-        return found
+            result[:, :, :moving] = np.tensordot(differentiate, G, 1)
+        return result
 
     @cached_property
     def dependent(self) -> np.ndarray:
@@ -114,15 +114,15 @@ class Linearised:
     def directions(self) -> np.ndarray:
         """N, N' and N'' (3, S, n), see the module; the identity without a loop."""
         d, i = self.dependent, self.independent
-        found = np.zeros((3, self.system.num_coordinates, len(i)))
-        found[0, i, np.arange(len(i))] = 1.0
+        result = np.zeros((3, self.system.num_coordinates, len(i)))
+        result[0, i, np.arange(len(i))] = 1.0
         G, Gd, Gdd = self.constraints
-        N, Nd, Ndd = found
+        N, Nd, Ndd = result
         inverse = np.linalg.pinv(G[:, d])
         N[d] = -inverse @ G @ N
         Nd[d] = -inverse @ Gd @ N
         Ndd[d] = -inverse @ (Gdd @ N + 2.0 * Gd @ Nd)
-        return found
+        return result
 
     @cached_property
     def reduced(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -147,8 +147,8 @@ class Linearised:
                 "bearing a cart_mass, and bearings no stiffness about their joint's own axis: "
                 "gear_stiffness is the spring there"
             )
-        found: np.ndarray = scale[:, None] * np.linalg.solve(scaled, scale[:, None] * forces)
-        return found
+        result: np.ndarray = scale[:, None] * np.linalg.solve(scaled, scale[:, None] * forces)
+        return result
 
     @cached_property
     def A(self) -> np.ndarray:

@@ -220,10 +220,10 @@ class MachineSystem:
 
         (N' G_e K^-1 G_e' N)^-1 N' g_0, N spanning P: it is told, not summed in.
         """
-        found = self.redundant_at(self.motion(np.zeros(1)))
-        if found is None:
+        result = self.redundant_at(self.motion(np.zeros(1)))
+        if result is None:
             return 0.0
-        P, left = (x[0] for x in found)
+        P, left = (x[0] for x in result)
         elastic = self._elastic_jacobian[0]
         softness = P @ elastic @ np.linalg.solve(self.mechanism.stiffness(), elastic.T @ P)
         forces = np.linalg.pinv(softness, rcond=1e-9, hermitian=True) @ left

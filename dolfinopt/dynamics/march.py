@@ -52,11 +52,11 @@ def march_on_grid(stages: Stages, state: State, tolerance: float, limits: Limits
     for first in range(0, count, WINDOW_STEPS[0]):
         window = stages.window(first, min(first + WINDOW_STEPS[0], count))
         held = np.broadcast_to(a[-1, -1], (len(window.h), *shape))
-        found = newton(window, state, held, tolerance, limits)
-        if not found.converged:
+        result = newton(window, state, held, tolerance, limits)
+        if not result.converged:
             raise GivenUp(f"Newton's method fails at step {first + 1} of {count}; {REMEDY}")
-        q, qd = step_ends(window, state, found.a)
-        a, state = np.concatenate([a, found.a]), (q[-1:], qd[-1:])
+        q, qd = step_ends(window, state, result.a)
+        a, state = np.concatenate([a, result.a]), (q[-1:], qd[-1:])
     return a[1:]
 
 
@@ -144,13 +144,13 @@ class March:
         grid = self._next_steps(end, horizon)
         stages = stages_of(self._preconditioner, self._method, grid, self.size)
         first = self._first_guess(grid)
-        found = newton(stages, self.state, first, self._error, WINDOW_LIMITS)
-        self._iterations += found.iterations
-        if not found.converged:
+        result = newton(stages, self.state, first, self._error, WINDOW_LIMITS)
+        self._iterations += result.iterations
+        if not result.converged:
             self._shorten(grid)
             return
-        errors = estimate(stages, grid, self.state, found.a, found.matrix)
-        self._accept(stages, grid, found.a, errors)
+        errors = estimate(stages, grid, self.state, result.a, result.matrix)
+        self._accept(stages, grid, result.a, errors)
 
     def _next_steps(self, end: float, horizon: float) -> np.ndarray:
         """Return the ends of the next window's steps, s."""

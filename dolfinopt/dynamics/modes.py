@@ -56,8 +56,8 @@ def _coupled(system: MachineSystem) -> bool:
     """
     if system.num_redundant == 0:
         return False
-    found = system.redundant_at(system.motion(np.linspace(0.0, system.breakpoints[-1], 5)))
-    return found is not None and bool(np.ptp(found[0], axis=0).max() > RANK_SHARE)
+    result = system.redundant_at(system.motion(np.linspace(0.0, system.breakpoints[-1], 5)))
+    return result is not None and bool(np.ptp(result[0], axis=0).max() > RANK_SHARE)
 
 
 def _vibrations(K: np.ndarray, M: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -154,11 +154,11 @@ def newton_in_chunks(
     pieces, spent = a.copy(), 0
     for part in parts:
         window = stages.window(part.start, part.stop)
-        found = newton(window, state, a[part], tolerance, limits)
-        pieces[part], spent = found.a, spent + found.iterations
-        if not found.converged:
+        result = newton(window, state, a[part], tolerance, limits)
+        pieces[part], spent = result.a, spent + result.iterations
+        if not result.converged:
             return Iterate(pieces, False, spent)
-        q, qd = step_ends(window, state, found.a)
+        q, qd = step_ends(window, state, result.a)
         state = (q[-1:], qd[-1:])
-    matrix = found.matrix if len(parts) == 1 else None
+    matrix = result.matrix if len(parts) == 1 else None
     return Iterate(pieces, True, round(spent / len(parts)), matrix)

@@ -104,7 +104,7 @@ def _real_parts(x: np.ndarray, conjugate: bool = False) -> np.ndarray:
     return np.concatenate([x.real, -x.imag if conjugate else x.imag], axis=-1)
 
 
-def poles_of(one: Linearised) -> Poles:
+def poles_of(linearised: Linearised) -> Poles:
     """Return the poles of a machine.
 
     Raises:
@@ -112,26 +112,28 @@ def poles_of(one: Linearised) -> Poles:
     """
     from scipy.linalg import eig
 
-    _, D, M = one.reduced
-    n, (_, moving, last) = len(M), one.system.ends
-    values, left, right = eig(one.A, left=True, right=True)
+    _, D, M = linearised.reduced
+    n, (_, moving, last) = len(M), linearised.system.ends
+    values, left, right = eig(linearised.A, left=True, right=True)
     above = np.flatnonzero(values.imag >= 0.0)
     values, v = values[above], right[:n, above]
     w = np.linalg.solve(M.T, np.conj(left[n:, above]))
     w = w / np.einsum("ip,ip->p", w, 2.0 * values * (M @ v) + D @ v)
-    N, Nd, Ndd = one.directions
+    N, Nd, Ndd = linearised.directions
     p, W = N @ v, N @ w
     vibrations = np.stack(
         [p, values * p + Nd @ v, values**2 * p + 2.0 * values * (Nd @ v) + Ndd @ v]
     )
-    forces = one.K @ vibrations[0] + one.D @ vibrations[1] + one.M @ vibrations[2]
+    forces = (
+        linearised.K @ vibrations[0] + linearised.D @ vibrations[1] + linearised.M @ vibrations[2]
+    )
     rows = np.setdiff1d(np.arange(len(N)), np.arange(moving, last))
-    vibrations[2, moving:last] = -np.linalg.pinv(one.M[rows, moving:last]) @ forces[rows]
+    vibrations[2, moving:last] = -np.linalg.pinv(linearised.M[rows, moving:last]) @ forces[rows]
     # W weighs changes of p, p' and p'' of the dependent coordinates, which changes of G make.
-    G, Gd, Gdd = one.constraints[:, :, one.dependent].swapaxes(1, 2)
-    K, D, M = (x[:, one.dependent].T @ W for x in (one.K, one.D, one.M))
+    G, Gd, Gdd = linearised.constraints[:, :, linearised.dependent].swapaxes(1, 2)
+    K, D, M = (x[:, linearised.dependent].T @ W for x in (linearised.K, linearised.D, linearised.M))
     inverse = np.linalg.pinv(G)
     third = inverse @ M
     second = inverse @ (D - 2.0 * Gd @ third)
     first = inverse @ (K - Gd @ second - Gdd @ third)
-    return Poles(one, values, vibrations, W, -np.stack([first, second, third]))
+    return Poles(linearised, values, vibrations, W, -np.stack([first, second, third]))

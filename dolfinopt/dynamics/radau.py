@@ -233,19 +233,19 @@ class _Integration:
     def solve(self, guess: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the accelerations by Newton's method, and whether it has converged."""
         stages = self._steps()
-        found = newton_in_chunks(stages, self._state, guess, self._tolerance, HORIZON_LIMITS)
-        self._iterations, self._matrix = self._iterations + found.iterations, found.matrix
-        return found.a, found.converged
+        result = newton_in_chunks(stages, self._state, guess, self._tolerance, HORIZON_LIMITS)
+        self._iterations, self._matrix = self._iterations + result.iterations, result.matrix
+        return result.a, result.converged
 
     def judged(self, a: np.ndarray) -> tuple[Solution, np.ndarray]:
         """Return the solution with its estimated error, and the errors (n,) that steps add."""
         stages = self._steps()
-        found = estimate(stages, self.time_grid, self._state, a, self._matrix)
+        result = estimate(stages, self.time_grid, self._state, a, self._matrix)
         vibrations, lost = unresolved(stages, self.time_grid, self._state, a)
         begin, c = step_beginnings(stages, self._state, a), stages.method.c
         spent, how = self._iterations, self.strategy
-        error = found.error + vibrations
-        return Solution(self.time_grid, c, *begin, a, error, spent, how), found.steps + lost
+        error = result.error + vibrations
+        return Solution(self.time_grid, c, *begin, a, error, spent, how), result.steps + lost
 
     def _steps(self) -> Stages:
         """Return the stages of the present steps."""

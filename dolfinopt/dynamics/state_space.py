@@ -48,21 +48,21 @@ class StateSpace:
     @property
     def poles(self) -> np.ndarray:
         """Eigenvalues of A, 1/s, slowest first; of a pair the one above the real axis first."""
-        found = np.linalg.eigvals(self.A).astype(complex)
-        return found[np.lexsort((-found.imag, np.round(np.abs(found), 9)))]
+        result = np.linalg.eigvals(self.A).astype(complex)
+        return result[np.lexsort((-result.imag, np.round(np.abs(result), 9)))]
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return all of it as arrays by name, as files have it; frequencies in Hz."""
-        found = {key: np.asarray(value) for key, value in vars(self).items()}
+        result = {key: np.asarray(value) for key, value in vars(self).items()}
         poles = self.poles
-        return found | {
+        return result | {
             "poles": poles,
             "frequencies": np.abs(poles) / (2.0 * np.pi),
             "damping_ratios": damping_ratios(poles),
         }
 
 
-def linear_model(one: Linearised, closed: bool) -> StateSpace:
+def linear_model(linearised: Linearised, closed: bool) -> StateSpace:
     """Return a linearised machine with all drives free as A, B, C, D.
 
     Inputs are the drives' forces, in a closed loop those that are added to the control's, and force
@@ -70,23 +70,23 @@ def linear_model(one: Linearised, closed: bool) -> StateSpace:
     of joints behind springs the motors'; the end-effector's displacement; and the part of it that
     the arms' deformation makes, the rigid coordinates held. `closed`: whether the control acts.
     """
-    system, N = one.system, one.directions[0]
+    system, N = linearised.system, linearised.directions[0]
     d, names = system.mechanism.dim.d, system.names
     driven = system.drive_columns[system.drives.driven]
-    drives, wrench = np.eye(system.num_coordinates)[:, driven], _wrench(one)
+    drives, wrench = np.eye(system.num_coordinates)[:, driven], _wrench(linearised)
     b = N.T @ np.hstack([drives, wrench])
     place = wrench[:, :d].T
     bent = np.zeros_like(place)
     bent[:, system.elastic_columns] = place[:, system.elastic_columns]
     outputs = np.vstack([drives.T, place, bent]) @ N
     every = coordinate_names(system)
-    kept = [every[k] for k in one.independent]
+    kept = [every[k] for k in linearised.independent]
     units = [names.units[name] for name in names.driven]
     wrench_units = [*["N"] * d, *["N m"] * (wrench.shape[1] - d)]
     return StateSpace(
-        time=float(one.t[0]),
-        A=one.A,
-        B=np.vstack([np.zeros_like(b), one.accelerations(b)]),
+        time=float(linearised.t[0]),
+        A=linearised.A,
+        B=np.vstack([np.zeros_like(b), linearised.accelerations(b)]),
         C=np.hstack([outputs, np.zeros_like(outputs)]),
         D=np.zeros((len(outputs), b.shape[1])),
         states=(*kept, *(f"{name} rate" for name in kept)),
@@ -124,11 +124,11 @@ def coordinate_names(system: MachineSystem) -> list[str]:
     return names + [f"motor of {rigid[int(k)]}" for k in joints]
 
 
-def _wrench(one: Linearised) -> np.ndarray:
+def _wrench(linearised: Linearised) -> np.ndarray:
     """Return what unit forces and moments on the end-effector are on every unknown (S, d + r)."""
-    system, dim, state = one.system, one.system.mechanism.dim, one.state
+    system, dim, state = linearised.system, linearised.system.mechanism.dim, linearised.state
     posed = Posed(system.mechanism, state.motion.q, state.elastic[0])
     site = SiteMotion(posed, system.mechanism.end, np.zeros(dim.d), np.eye(dim.d))
-    found = np.zeros((system.num_coordinates, dim.b))
-    found[: system.ends[1]] = site.by[:, system.columns, 0].T
-    return found
+    result = np.zeros((system.num_coordinates, dim.b))
+    result[: system.ends[1]] = site.by[:, system.columns, 0].T
+    return result

@@ -97,7 +97,7 @@ class MachineTrajectory:
     @property
     def solutions(self) -> tuple[Solution, ...]:
         """Its own and the scenarios'."""
-        return (self.solution, *(one.solution for one in self.scenarios))
+        return (self.solution, *(scenario.solution for scenario in self.scenarios))
 
     @property
     def mechanism(self) -> Mechanism:
@@ -236,19 +236,19 @@ class MachineTrajectory:
     @property
     def closure_sizes(self) -> dict[str, dict[str, np.ndarray]]:
         """Magnitude of every closure's force and moment (n,), by name and unit."""
-        found: dict[str, dict[str, np.ndarray]] = {}
+        result: dict[str, dict[str, np.ndarray]] = {}
         forces, k = self.closure_force, 0
         if forces is None:
-            return found
+            return result
         for tie in self.problem.loops.ties if self.problem.loops else ():
             units = tie.units
             own = forces[:, k : k + len(units)]
-            found[tie.name] = {
+            result[tie.name] = {
                 unit: np.linalg.norm(own[:, [u == unit for u in units]], axis=1)
                 for unit in dict.fromkeys(units)
             }
             k += len(units)
-        return found
+        return result
 
     @cached_property
     def end(self) -> np.ndarray:

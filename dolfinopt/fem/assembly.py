@@ -306,9 +306,9 @@ class Cells:
         first, *others = self._corners[:, cells]
         out = np.empty((len(others), len(rows), len(first)))
         origin = rows.take(first, axis=1, mode="clip")
-        for corner, found in zip(others, out, strict=True):
-            np.take(rows, corner, axis=1, out=found, mode="clip")
-            found -= origin
+        for corner, result in zip(others, out, strict=True):
+            np.take(rows, corner, axis=1, out=result, mode="clip")
+            result -= origin
         return out
 
     def sum_of_differences(self, rows: np.ndarray) -> np.ndarray:
@@ -505,26 +505,26 @@ class StiffenedModes:
         q = self._shape[0]
         for run in self._runs:
             count, stiff = len(run.young), run.a * run.young
-            found = np.empty((len(self._pairs), q, q, count))
+            result = np.empty((len(self._pairs), q, q, count))
             both = np.empty((run.a.shape[1], q, q, count))
-            for out, (b, c) in zip(found, self._pairs, strict=True):
+            for out, (b, c) in zip(result, self._pairs, strict=True):
                 np.multiply(stiff[b][:, :, None], run.a[c][:, None], out=both)
                 both.sum(axis=0, out=out)
-            yield run, found.reshape(len(found), q * q, count)
+            yield run, result.reshape(len(result), q * q, count)
 
     def _by_modes(self, a: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Return the derivatives by differences a (r, d, q, cells), given those by products."""
         # The weights (bc, q q, cells) are symmetric in the modes, doubled for b = c.
-        q, found, term = a.shape[2], np.empty_like(a), np.empty_like(a[0])
+        q, result, term = a.shape[2], np.empty_like(a), np.empty_like(a[0])
         each = list(zip(weights.reshape(-1, q, q, a.shape[3]), self._pairs, strict=True))
         for weight, (b, c) in each:
             if b == c:
-                np.einsum("ije,xje->xie", weight, a[b], out=found[b])
+                np.einsum("ije,xje->xie", weight, a[b], out=result[b])
         for weight, (b, c) in each:
             if b != c:
-                found[b] += np.einsum("ije,xje->xie", weight, a[c], out=term)
-                found[c] += np.einsum("ije,xje->xie", weight, a[b], out=term)
-        return found
+                result[b] += np.einsum("ije,xje->xie", weight, a[c], out=term)
+                result[c] += np.einsum("ije,xje->xie", weight, a[b], out=term)
+        return result
 
 
 def geometric_matrix(cells: Cells, u: np.ndarray, modulus: np.ndarray) -> sp.csr_matrix:

@@ -54,15 +54,15 @@ def by_accelerated(by: np.ndarray, alpha: np.ndarray) -> np.ndarray:
 def by_alpha(by: np.ndarray, field: np.ndarray) -> np.ndarray:
     """Return the derivatives (k, c q) by alpha, given those by `accelerated` (n, d, k)."""
     products = np.tensordot(by, field, (0, 0))  # (a, k, b, q)
-    found = np.einsum("cab,akbq->kcq", SPINS[by.shape[1]], products)
-    return found.reshape(len(found), -1)
+    result = np.einsum("cab,akbq->kcq", SPINS[by.shape[1]], products)
+    return result.reshape(len(result), -1)
 
 
 def _spun(d: int, alpha: np.ndarray) -> np.ndarray:
     """Return the matrix (d q, d k) of `accelerated`."""
     E = SPINS[d]
-    found = np.einsum("cab,kcq->bqak", E, alpha.reshape(len(alpha), len(E), -1))
-    return found.reshape(-1, d * len(alpha))
+    result = np.einsum("cab,kcq->bqak", E, alpha.reshape(len(alpha), len(E), -1))
+    return result.reshape(-1, d * len(alpha))
 
 
 def accelerations(ones: np.ndarray, places: np.ndarray) -> np.ndarray:

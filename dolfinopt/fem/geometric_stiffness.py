@@ -93,8 +93,8 @@ class UnitLoads:
     def accelerations(self) -> np.ndarray:
         """The fields (n_nodes, d, k) whose inertia the first k loads are."""
         points = self.arm.points
-        found = accelerations(np.ones_like(points), points)
-        return found if self.modes is None else np.concatenate([found, self.modes], axis=2)
+        result = accelerations(np.ones_like(points), points)
+        return result if self.modes is None else np.concatenate([result, self.modes], axis=2)
 
     def by_levers(self, face: FaceGradient) -> np.ndarray:
         """Return the derivatives (n_nodes, d) by the interfaces' nodes, see `FaceRotation`."""
@@ -128,10 +128,10 @@ class UnitLoads:
         forces = forces + face.by_fields
         adjoint = arm.static_response(*arm.restrict(forces))
         by_V = by_V + face.by_modes
-        found = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, face)
+        result = GeometricGradient(self, V, by_K0, by_V, direct, forces, adjoint, face)
         if self.modes is None:
-            return found
-        return replace(found, by_modes=by_V + arm.mass_times(found.by_modal_inertia))
+            return result
+        return replace(result, by_modes=by_V + arm.mass_times(result.by_modal_inertia))
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,8 +275,8 @@ class FaceRotation:
 
     def _rotations(self, V: np.ndarray) -> np.ndarray:
         """Return the rotation vectors (m, c, q) in modes (n_nodes, d, q) (collective)."""
-        found = self.arm.substructure.T.coordinates(V)
-        return found.reshape(len(self._levers), -1, V.shape[2])[:, V.shape[1] :]
+        result = self.arm.substructure.T.coordinates(V)
+        return result.reshape(len(self._levers), -1, V.shape[2])[:, V.shape[1] :]
 
     def tensors(self, fields: np.ndarray, accelerations: np.ndarray) -> np.ndarray:
         """Return D (m, p, c, c) of unit loads, N m each (collective).
@@ -307,11 +307,11 @@ class FaceRotation:
             by_S: (m, p, d, d) by the moments of the reactions.
             fields, accelerations: see `tensors`.
         """
-        forces, found = self._reactions(fields, accelerations), np.zeros_like(self.arm.points)
+        forces, result = self._reactions(fields, accelerations), np.zeros_like(self.arm.points)
         for at, by in zip(self.arm.substructure.T.ends, by_S, strict=True):
             own = np.einsum("enap,pab->enb", forces, by) * at[self._nodes][:, :, None]
-            np.add.at(found, self._nodes, own)
-        return found
+            np.add.at(result, self._nodes, own)
+        return result
 
     def stiffness(self, D: np.ndarray, V: np.ndarray) -> np.ndarray:
         """Return what K0 (p, q, q) gains in modes V (n_nodes, d, q) (collective)."""

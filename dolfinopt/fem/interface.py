@@ -77,12 +77,12 @@ class InterfaceTransformation:
         self.dim = self.points.shape[1]
         self._ghosted = fem.Function(operators.space)
         sides = {"inboard": mesh.inboard_facets, "outboard": mesh.outboard_facets}
-        sides |= {one.name: one.facets for one in mesh.further}
+        sides |= {item.name: item.facets for item in mesh.further}
         masks = {name: self._nodes_of(mesh, facets, name) for name, facets in sides.items()}
-        for one, other in combinations(masks, 2):
-            if self.comm.allreduce(int((masks[one] & masks[other]).sum())):
+        for item, other in combinations(masks, 2):
+            if self.comm.allreduce(int((masks[item] & masks[other]).sum())):
                 raise InputError(
-                    f"arm {mesh.name!r}: interfaces {one!r} and {other!r} share nodes; "
+                    f"arm {mesh.name!r}: interfaces {item!r} and {other!r} share nodes; "
                     "each is rigid: leave a cell between them"
                 )
         self.inboard, *self.ends = masks.values()
@@ -215,8 +215,8 @@ class InterfaceTransformation:
 
         Of others those of the nearest rigid motion.
         """
-        found = np.tensordot(self._fit, field, ((0, 1), (0, 1)))
-        return np.asarray(self.comm.allreduce(found))
+        result = np.tensordot(self._fit, field, ((0, 1), (0, 1)))
+        return np.asarray(self.comm.allreduce(result))
 
     def by_coordinates(self, by: np.ndarray) -> np.ndarray:
         """Return the derivatives by a field (n_nodes, d, k), given those by `coordinates`."""
@@ -224,10 +224,10 @@ class InterfaceTransformation:
 
     def by_points(self, by_rigid: np.ndarray) -> np.ndarray:
         """Return the derivatives (n_nodes, d) by the nodes, given those by `rigid`."""
-        found = np.zeros_like(self.points)
+        result = np.zeros_like(self.points)
         for at, by in zip(self.ends, np.split(by_rigid, len(self.ends), axis=2), strict=True):
-            found[at] += by_rigid_motions(by[at])
-        return found
+            result[at] += by_rigid_motions(by[at])
+        return result
 
     def _to_owners(self, field: np.ndarray) -> np.ndarray:
         """Add the ghosts' rows of a nodal field to their owners' rows."""
@@ -355,15 +355,15 @@ def static_fields(arm: ElasticArm, loads: np.ndarray, known: StaticFields | None
         return StaticFields(np.eye(b), modes.field, np.eye(b), modes.stiffness)
     interior, tip = arm.solve_loads(new)
     field = np.concatenate([known.field, arm.expand(interior, tip)], axis=2)
-    found = StaticFields(
+    result = StaticFields(
         np.hstack([known.directions, new]),
         field,
         np.hstack([known.tip, tip]),
         arm.energy_matrix(field),
     )
-    if not _is_stiffness(found.stiffness):
+    if not _is_stiffness(result.stiffness):
         raise _lost_in_rounding(arm)
-    return found
+    return result
 
 
 def _new_directions(known: np.ndarray, loads: np.ndarray, tolerance: float) -> np.ndarray:

@@ -75,7 +75,7 @@ class Kernel:
 
 def _of_cells(count: int, parts: Sequence[np.ndarray]) -> np.ndarray:
     """Return values (1 or n_cells, dofs) side by side, of every cell."""
-    rows = [np.broadcast_to(one, (count, one.shape[1])) for one in parts]
+    rows = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
     return np.ascontiguousarray(np.hstack([np.zeros((count, 0)), *rows]))
 
 

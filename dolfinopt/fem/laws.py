@@ -106,7 +106,7 @@ class Orthotropic(MaterialLaw):
         E = np.array(solid.young_modulus)
         E = np.append(E, E[-1])[:dim] / E[0]
         nu, G = (
-            np.resize(np.array(one), shears) for one in (solid.poisson_ratio, solid.shear_modulus)
+            np.resize(np.array(item), shears) for item in (solid.poisson_ratio, solid.shear_modulus)
         )
         compliance = np.zeros((dim + shears, dim + shears))
         compliance[range(dim), range(dim)] = 1.0 / E

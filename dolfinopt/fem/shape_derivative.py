@@ -64,20 +64,20 @@ class ShapeDerivative:
 
     def stiffness(self, left: np.ndarray, right: np.ndarray, young: np.ndarray) -> np.ndarray:
         """Differentiate sum_k left_k' K right_k of nodal fields (n_nodes, d, k)."""
-        operators, found = self._operators, np.zeros_like(self._operators.corners)
+        operators, result = self._operators, np.zeros_like(self._operators.corners)
         for part in self._runs(left.shape[2]):
             points = self._stiffness_points(part)
             u, v = (points.gradients(*self._values(field, part)) for field in (left, right))
-            found[part] = points.by_corners(young[part], self._energy(part, u, v))
-        return operators.thickness * found
+            result[part] = points.by_corners(young[part], self._energy(part, u, v))
+        return operators.thickness * result
 
     def mass(self, left: np.ndarray, right: np.ndarray, density: np.ndarray) -> np.ndarray:
         """Differentiate sum_k left_k' M right_k of nodal fields (n_nodes, d, k)."""
-        cell, found = self._cell, self._zeros()
+        cell, result = self._cell, self._zeros()
         for p, w in zip(self._columns(left), self._columns(right), strict=True):
             values = {cell.p: p, cell.w: w, cell.weight: density[:, None]}
-            found += self._by_corners(values, forms.mass_product)
-        return self._operators.thickness * found
+            result += self._by_corners(values, forms.mass_product)
+        return self._operators.thickness * result
 
     def volume(self, by_volume: np.ndarray) -> np.ndarray:
         """Differentiate a function of the cells' areas, in space volumes (n_cells,)."""
@@ -96,7 +96,7 @@ class ShapeDerivative:
             by_K0: (p, q, q).
             young: (n_cells,).
         """
-        operators, found = self._operators, np.zeros_like(self._operators.corners)
+        operators, result = self._operators, np.zeros_like(self._operators.corners)
         by = 0.5 * (by_K0 + by_K0.swapaxes(1, 2)).reshape(len(by_K0), -1)
         rule = gauss_points(operators.cell, forms.geometric_degree(operators.cell))
         for part in self._runs(sum(by.shape)):
@@ -107,9 +107,9 @@ class ShapeDerivative:
             P, P0 = varied(along, u)
             P = P + times_one(stress, G) - 2.0 * (G @ stress).sum(axis=2)
             by_amplitudes = points.by_amplitudes(young[part], along)
-            found[part] = points.by_corners(young[part], (P, P0))
-            found[part] += self._followed(part, values, by_amplitudes)
-        return operators.thickness * found
+            result[part] = points.by_corners(young[part], (P, P0))
+            result[part] += self._followed(part, values, by_amplitudes)
+        return operators.thickness * result
 
     def stress(self, at: np.ndarray, by_stress: np.ndarray, fields: np.ndarray) -> np.ndarray:
         """Differentiate a function of stresses, see `fem.stress.stress_operator`, fields held.
@@ -121,16 +121,16 @@ class ShapeDerivative:
         """
         by = by_stress.reshape(len(by_stress), len(self._coordinates), len(at), -1)
         by = np.tensordot(by, VON_MISES[self._cell.dim], (0, 0))  # by the stresses themselves
-        operators, found = self._operators, np.zeros_like(self._operators.corners)
+        operators, result = self._operators, np.zeros_like(self._operators.corners)
         for part in self._runs(by.shape[2]):
             points, values = GaussPoints(operators, part, at), self._values(fields, part)
             C, ones = of_cells(self._tangent, part), np.ones(len(by[part]))
             along = (by[part] @ C[:, None])[..., ROWS[operators.cell.dim]]
             parts = varied(along, points.gradients(*values))
             by_amplitudes = points.by_amplitudes(ones, along)
-            found[part] = points.by_corners(ones, parts)
-            found[part] += self._followed(part, values, by_amplitudes)
-        return found
+            result[part] = points.by_corners(ones, parts)
+            result[part] += self._followed(part, values, by_amplitudes)
+        return result
 
     # -- of runs of cells ----------------------------------------------------------------------
 

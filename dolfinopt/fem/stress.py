@@ -55,10 +55,10 @@ def stress_operator(operators: ElementTensors, points: np.ndarray) -> sp.csr_mat
     """
     dim, nodes = operators.cell.dim, operators.cells
     dofs = (dim * nodes[:, :, None] + np.arange(dim)).reshape(len(nodes), -1)
-    found = VON_MISES[dim] @ operators.stress(points)  # (1 or n_cells, p, s, dn)
-    kinds, size = found.shape[2:]
+    result = VON_MISES[dim] @ operators.stress(points)  # (1 or n_cells, p, s, dn)
+    kinds, size = result.shape[2:]
     shape = kinds, len(nodes), len(points), size
-    values = np.broadcast_to(np.moveaxis(found, 2, 0), shape)
+    values = np.broadcast_to(np.moveaxis(result, 2, 0), shape)
     columns = np.broadcast_to(dofs.astype(np.int32)[:, None], shape)
     starts = np.arange(0, values.size + 1, size)
     return sp.csr_matrix(

@@ -141,15 +141,15 @@ class ElementTensors:
         points, weights = gauss_points(self.cell, forms.geometric_degree(self.cell))
         b, c = np.triu_indices(self.cells.shape[1] - 1)
         weights = weights[:, None] * self.thickness * np.where(b == c, 1.0, 2.0)
-        found = []
+        result = []
         for part, (stress, gradients) in self._tabulated(forms.geometric_factors, places(points)):
             left, right = (np.moveaxis(gradients[..., 1 + at], 2, 0) for at in (b, c))
             products = [*(left * right)]
             products += [left[i] * right[j] + left[j] * right[i] for i, j in SHEARS[self.cell.dim]]
             rows = (weights * np.stack(products)).transpose(1, 3, 2, 0)
             S = self._recovered(stress, part)[..., self.cell.dim :]
-            found.append(rows.reshape(*rows.shape[:2], -1) @ S.reshape(len(S), -1, S.shape[3]))
-        return np.concatenate(found)
+            result.append(rows.reshape(*rows.shape[:2], -1) @ S.reshape(len(S), -1, S.shape[3]))
+        return np.concatenate(result)
 
 
 @cache
@@ -214,7 +214,7 @@ def single(comm: MPI.Comm, arrays: np.ndarray) -> np.ndarray | None:
     if count == 0:
         return None
     some = comm.allgather(arrays[0].copy() if len(arrays) else None)
-    first = next(one for one in some if one is not None)
+    first = next(item for item in some if item is not None)
     mean = first + comm.allreduce((arrays - first).sum(axis=0)) / count
     error = comm.allreduce(np.abs(arrays - mean).max(initial=0.0), op=MPI.MAX)
     return mean if error <= ALIKE_CELLS_ERROR * np.abs(mean).max() else None

@@ -48,14 +48,14 @@ class Block:
 
     def read(self, line: int, values: Iterable[str], kind: Callable[[str], float]) -> list[float]:
         """Return the values of a line as numbers of a kind."""
-        found = []
+        result = []
         for value in values:
             try:
-                found.append(kind(value))
+                result.append(kind(value))
             except ValueError:
                 noun = "an integer" if kind is int else "a number"
                 raise self.error(line, f"{value[:40]!r} is not {noun}") from None
-        return found
+        return result
 
 
 @dataclass

@@ -94,12 +94,12 @@ class ArmMesh:
     @property
     def further_points(self) -> np.ndarray:
         """Reference points of the further outboard interfaces (i, d), m."""
-        return np.reshape([one.point for one in self.further], (-1, self.dim)).astype(float)
+        return np.reshape([item.point for item in self.further], (-1, self.dim)).astype(float)
 
     @property
     def interface_facets(self) -> np.ndarray:
         """Facets of all interfaces, local numbers."""
-        more = [one.facets for one in self.further]
+        more = [item.facets for item in self.further]
         return np.concatenate([self.inboard_facets, self.outboard_facets, *more])
 
     @property
@@ -182,8 +182,12 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
     with together(comm):
         mesh, tags = _tagged(comm, arm, *parts), parts[2]
         further = tuple(
-            InterfaceFacets(one.name, tags.indices[tags.values == FURTHER + k], np.array(point))
-            for k, (one, point) in enumerate(zip(arm.further_interfaces, arm.interface_points[1:]))
+            InterfaceFacets(
+                interface.name, tags.indices[tags.values == FURTHER + k], np.array(point)
+            )
+            for k, (interface, point) in enumerate(
+                zip(arm.further_interfaces, arm.interface_points[1:])
+            )
         )
         mesh.passive[:] |= _distance(mesh.centroid, facets) < arm.solid_ends
     return replace(mesh, notes=notes, further=further)
@@ -238,8 +242,8 @@ def with_regions(mesh: ArmMesh, arm: scenes.Arm, scale: Sequence[float]) -> ArmM
     if arm.mesh is not None and (problem := region_problem(arm, _all_cells(mesh))):
         number, reason = problem
         raise InputError(f"arm {arm.name!r}: region {number} of arms.regions: {reason}")
-    found = region_cells(arm, centroid)
-    return replace(mesh, passive=mesh.passive | found.solid, void=mesh.void | found.void)
+    result = region_cells(arm, centroid)
+    return replace(mesh, passive=mesh.passive | result.solid, void=mesh.void | result.void)
 
 
 def _all_cells(mesh: ArmMesh) -> Cells:
@@ -309,19 +313,19 @@ def box_arm(
         passive: length kept solid at both ends, m; whole layers of cells whose centre lies within.
     """
     length, *across = size
-    low = np.array([0.0, *(-0.5 * one for one in across)])
-    mesh = compat.box_mesh(comm, low, np.array([length, *(0.5 * one for one in across)]), cells)
+    low = np.array([0.0, *(-0.5 * item for item in across)])
+    mesh = compat.box_mesh(comm, low, np.array([length, *(0.5 * item for item in across)]), cells)
     with together(comm):
         for k in range(len(size)):
             snap(mesh.geometry.x[:, k], low[k], size[k] / cells[k])
     ends = [compat.facets_on(mesh, x, 0.25 * length / cells[0]) for x in (0.0, length)]
     owned, _ = compat.local_cell_counts(mesh)
     with together(comm):
-        found = _arm_mesh(comm, name, length, mesh, [*np.zeros((2, owned), dtype=bool)], ends)
+        result = _arm_mesh(comm, name, length, mesh, [*np.zeros((2, owned), dtype=bool)], ends)
         layers = math.ceil(passive / length * cells[0] - 0.5)  # as in meshes/arm.geo
-        layer = np.floor(found.centroid[:, 0] / length * cells[0])
-        found.passive[:] = (layer < layers) | (layer >= cells[0] - layers)
-        return found
+        layer = np.floor(result.centroid[:, 0] / length * cells[0])
+        result.passive[:] = (layer < layers) | (layer >= cells[0] - layers)
+        return result
 
 
 # -- further outboard interfaces of a box: the sides of its cells near a point of its surface ----
@@ -344,25 +348,25 @@ def with_interfaces(mesh: ArmMesh, arm: scenes.Arm, passive: float) -> ArmMesh:
     sides = corners[:, around]  # (cells, sides, corners, 3)
     middles, outer = sides.mean(axis=2), _outer(mesh, sides.mean(axis=2), arm)
     taken = np.isin(facets, np.concatenate([mesh.inboard_facets, mesh.outboard_facets]))
-    found, solid = [], mesh.passive.copy()
-    for one in arm.further_interfaces:
-        point = np.array(one.point)
-        assert one.radius is not None
+    result, solid = [], mesh.passive.copy()
+    for interface in arm.further_interfaces:
+        point = np.array(interface.point)
+        assert interface.radius is not None
         distance = np.linalg.norm(middles - point, axis=2)
-        own = outer & (distance <= (1.0 + GRID_ROUNDING_SHARE) * one.radius)
+        own = outer & (distance <= (1.0 + GRID_ROUNDING_SHARE) * interface.radius)
         problem = _problem(mesh.comm, own, own & taken, distance[outer])
         with together(mesh.comm):
             if problem:
                 raise InputError(
-                    f"arm {arm.name!r}: interface {one.name!r}: {problem}; change its point "
-                    f"{list(one.point)} or radius {one.radius:g} [m]"
+                    f"arm {arm.name!r}: interface {interface.name!r}: {problem}; change its point "
+                    f"{list(interface.point)} or radius {interface.radius:g} [m]"
                 )
         taken |= own
-        found.append(InterfaceFacets(one.name, np.unique(facets[own]), point))
+        result.append(InterfaceFacets(interface.name, np.unique(facets[own]), point))
         places = np.concatenate(mesh.comm.allgather(middles[own]))
         across = 2 if arm.extruded else 3  # of a plate, through its thickness
         solid |= cKDTree(places[:, :across]).query(mesh.centroid[:, :across])[0] < passive
-    return replace(mesh, further=tuple(found), passive=solid)
+    return replace(mesh, further=tuple(result), passive=solid)
 
 
 def _outer(mesh: ArmMesh, middles: np.ndarray, arm: scenes.Arm) -> np.ndarray:

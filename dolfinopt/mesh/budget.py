@@ -38,9 +38,9 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
         mine += shared * cells[k] * _cell_bytes(scene, k) / partition.comm.size
     needed: dict[str, float] = defaultdict(float)
     free: dict[str, float] = {}
-    for machine, need, found in world.allgather((MPI.Get_processor_name(), mine, free_memory())):
+    for machine, need, result in world.allgather((MPI.Get_processor_name(), mine, free_memory())):
         needed[machine] += need
-        free[machine] = min(found, free.get(machine, math.inf))
+        free[machine] = min(result, free.get(machine, math.inf))
     machine = max(needed, key=lambda name: needed[name] / max(free[name], 1.0))
     if needed[machine] <= free[machine]:
         return

@@ -200,10 +200,10 @@ def keys_of(facets: np.ndarray, largest: int) -> np.ndarray:
 
     The three smallest corners tell facets apart.
     """
-    found = np.zeros(len(facets), dtype=np.int64)
+    result = np.zeros(len(facets), dtype=np.int64)
     for corner in np.sort(facets, axis=1)[:, :3].T:
-        found = found * (largest + 1) + corner
-    return found
+        result = result * (largest + 1) + corner
+    return result
 
 
 def _overlapping(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
@@ -218,7 +218,7 @@ def _overlapping(corners: np.ndarray, keys: np.ndarray) -> np.ndarray:
     normal, middle = facet_areas(facets), facets.mean(axis=1)
     centre = corners.mean(axis=1)
     heights = [
-        np.einsum("ij,ij->i", normal, centre[one % count] - middle) for one in (first, second)
+        np.einsum("ij,ij->i", normal, centre[item % count] - middle) for item in (first, second)
     ]
     one_side = heights[0] * heights[1] >= 0.0
     for which in (first, second):

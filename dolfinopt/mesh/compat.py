@@ -224,10 +224,10 @@ def cell_facets(mesh: Any, num_cells: int) -> np.ndarray:
 
 def facets_on(mesh: Any, plane: float, tolerance: float) -> np.ndarray:
     """Return the local numbers of this rank's boundary facets on the plane x = `plane`."""
-    found = dolfinx.mesh.locate_entities_boundary(
+    result = dolfinx.mesh.locate_entities_boundary(
         mesh, mesh.topology.dim - 1, lambda x: np.abs(x[0] - plane) < tolerance
     )
-    return np.asarray(found, dtype=np.int32)
+    return np.asarray(result, dtype=np.int32)
 
 
 def box_mesh(comm: MPI.Comm, low: np.ndarray, high: np.ndarray, cells: tuple[int, ...]) -> Any:

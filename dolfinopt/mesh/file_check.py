@@ -193,7 +193,7 @@ def _refused(line: int, what: str, why: str) -> InputError:
 
 
 def _tokens(text: str) -> list[_Token]:
-    found, place, line = [], 0, 1
+    result, place, line = [], 0, 1
     while place < len(text):
         match = _TOKEN.match(text, place)
         if match is None:
@@ -207,10 +207,10 @@ def _tokens(text: str) -> list[_Token]:
                 raise _refused(line, f"{piece[:20]!r}...", "is too long or goes over several lines")
             if ENDS.search(piece) and piece not in HARMLESS:
                 raise _refused(line, piece, "holds a word that ends a block")
-            found.append(_Token(kind, piece, line))
+            result.append(_Token(kind, piece, line))
         line += piece.count("\n")
         place = match.end()
-    return found
+    return result
 
 
 class _Checker:

@@ -152,7 +152,7 @@ def _named_groups(gmsh: Any, arm: Arm, unknown: list[str]) -> Entities:
     Other names of cells are added to `unknown`.
     """
     model, dim = gmsh.model, 3 if arm.is_solid else 2
-    found, names = no_groups(arm), []
+    result, names = no_groups(arm), []
     for d, tag in model.getPhysicalGroups():
         name = model.getPhysicalName(d, tag).strip()
         if d < dim - 1 or not name:
@@ -165,18 +165,18 @@ def _named_groups(gmsh: Any, arm: Arm, unknown: list[str]) -> Entities:
                 unknown.append(name)
                 continue
         if group is not None:
-            found[group] += [int(one) for one in model.getEntitiesForPhysicalGroup(d, tag)]
-    _check_interfaces(model, found, sorted(set(names)), arm)
+            result[group] += [int(item) for item in model.getEntitiesForPhysicalGroup(d, tag)]
+    _check_interfaces(model, result, sorted(set(names)), arm)
     every = [tag for _, tag in model.getEntities(dim) if _has_elements(model, dim, tag)]
-    stays = {*found[PASSIVE], *found[VOID]}
-    found[DESIGN] = found[DESIGN] or [tag for tag in every if tag not in stays]
+    stays = {*result[PASSIVE], *result[VOID]}
+    result[DESIGN] = result[DESIGN] or [tag for tag in every if tag not in stays]
     for a, b in ((INBOARD, OUTBOARD), (DESIGN, PASSIVE)):
-        if both := {*found[a]} & {*found[b]}:
+        if both := {*result[a]} & {*result[b]}:
             raise InputError(
                 f"{ENTITY[dim - (a == INBOARD)]} {min(both)} is in both groups "
                 f'"{NAMES[a]}" and "{NAMES[b]}"; give each its own geometrical entity'
             )
-    return found
+    return result
 
 
 def _has_elements(model: Any, dim: int, entity: int) -> bool:
@@ -187,7 +187,7 @@ def _check_interfaces(model: Any, found: Entities, names: list[str], arm: Arm) -
     """Raise InputError where an interface is in no group of the file."""
     d, kind = (2, "faces") if arm.is_solid else (1, "curves")
     for tag, name in interface_names(arm).items():
-        if tag in bores_of(arm) or any(_has_elements(model, d, one) for one in found[tag]):
+        if tag in bores_of(arm) or any(_has_elements(model, d, item) for item in found[tag]):
             continue
         if found[tag]:
             raise InputError(
@@ -202,11 +202,11 @@ def _check_interfaces(model: Any, found: Entities, names: list[str], arm: Arm) -
 def _set_groups(gmsh: Any, groups: Entities, arm: Arm) -> None:
     """Put our groups in place of the file's, after a look at the kinds of cells."""
     model, dim = gmsh.model, 3 if arm.is_solid else 2
-    _check_kinds(gmsh, [one for tag in (DESIGN, PASSIVE, VOID) for one in groups[tag]], arm)
+    _check_kinds(gmsh, [group for tag in (DESIGN, PASSIVE, VOID) for group in groups[tag]], arm)
     model.removePhysicalGroups()
     for tag, entities in groups.items():
         d = dim if tag in (DESIGN, PASSIVE, VOID) else dim - 1
-        if kept := sorted({one for one in entities if _has_elements(model, d, one)}):
+        if kept := sorted({entity for entity in entities if _has_elements(model, d, entity)}):
             model.addPhysicalGroup(d, kept, tag)
             model.setPhysicalName(d, tag, NAMES.get(tag, f"interface {tag}"))
     model.mesh.renumberNodes()  # DOLFINx wants 1, 2, ...
@@ -217,7 +217,7 @@ def _check_kinds(gmsh: Any, entities: list[int], arm: Arm) -> None:
     mesh, dim = gmsh.model.mesh, 3 if arm.is_solid else 2
     if dim == 2 and len(mesh.getElementTypes(3)):
         raise InputError("it is a mesh of a body in 3D; give the mesh of the plane z = 0")
-    kinds = {int(kind) for one in entities for kind in mesh.getElements(dim, one)[0]}
+    kinds = {int(kind) for entity in entities for kind in mesh.getElements(dim, entity)[0]}
     if not kinds:
         raise InputError(f"it has no cells; mesh its {ENTITY[dim]}s in {dim}D")
     if kinds == PLAIN[2]:
@@ -258,7 +258,7 @@ def _check(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
         Lines (n, 2, 2) of its interfaces; points (n, 1, 3) of the facets of a solid's.
     """
     dim = 3 if arm.is_solid else 2
-    points, regions = points_by_tag(gmsh), [one for tag in REGIONS for one in groups[tag]]
+    points, regions = points_by_tag(gmsh), [group for tag in REGIONS for group in groups[tag]]
     cells = elements_of(gmsh, dim, regions)
     cells = cells[:, TENSOR[cells.shape[1], dim]]
     facets = {
@@ -269,8 +269,8 @@ def _check(gmsh: Any, groups: Entities, arm: Arm) -> np.ndarray:
         if off > FILE_ROUNDING_SHARE * arm.height:
             raise InputError(f"it lies up to {off:.4g} m off the plane z = 0; move it there")
     check_mesh(points[:, :dim], cells, facets, arm)
-    corners = [points[one][:, :, :dim] for one in facets.values()]
+    corners = [points[facet][:, :, :dim] for facet in facets.values()]
     if dim == 2:
         return np.concatenate(corners)
-    parts = [part for one in corners for part in (one.reshape(-1, 3), one.mean(axis=1))]
+    parts = [part for corner in corners for part in (corner.reshape(-1, 3), corner.mean(axis=1))]
     return np.concatenate(parts)[:, None]

@@ -115,17 +115,17 @@ def in_child(work: Callable[..., Result], *given: Any) -> Result:
         child.start()
     theirs.close()
     try:
-        found = ours.recv()
+        result = ours.recv()
     except EOFError:
-        found = InputError("Gmsh gave up on it")
+        result = InputError("Gmsh gave up on it")
     except BaseException:  # Ctrl-C: nobody waits for it
         child.kill()
         raise
     finally:
         child.join()
-    if isinstance(found, Exception):
-        raise found
-    return cast(Result, found)
+    if isinstance(result, Exception):
+        raise result
+    return cast(Result, result)
 
 
 def _report(pipe: Connection, work: Callable[..., Any], given: tuple[Any, ...]) -> None:

@@ -257,9 +257,9 @@ class Hull:
     def by_thickness(self, by_points: np.ndarray) -> np.ndarray:
         """Return the derivatives (s, r) by the thickness, given those by `points` (2 s r, 3)."""
         outer, inner = by_points.reshape(2, *self.outer.shape)
-        found = (inner * self.inward).sum(axis=2)
-        np.add.at(found.T, self.lead, ((outer + inner) * self.slide).sum(axis=2).T)
-        return np.asarray(found)
+        result = (inner * self.inward).sum(axis=2)
+        np.add.at(result.T, self.lead, ((outer + inner) * self.slide).sum(axis=2).T)
+        return np.asarray(result)
 
     def member(self, thickness: np.ndarray | float) -> Member:
         """Return the mesh of a wall of this thickness, one or (s, r), m."""
@@ -422,9 +422,9 @@ class Wall:
         outer = outer.reshape(self.hull.outer.shape)
         ahead = np.roll(outer, -1, axis=1)
         sides = (ahead - outer)[:-1] + (ahead - outer)[1:]
-        found = np.cross(sides, (outer + ahead)[1:] - (outer + ahead)[:-1])
-        found /= np.linalg.norm(found, axis=2, keepdims=True)
-        return np.asarray(found.reshape(-1, 3)[self.cells])
+        result = np.cross(sides, (outer + ahead)[1:] - (outer + ahead)[:-1])
+        result /= np.linalg.norm(result, axis=2, keepdims=True)
+        return np.asarray(result.reshape(-1, 3)[self.cells])
 
     def points(self, comm: MPI.Comm, x: np.ndarray) -> np.ndarray:
         """Return the places (n, 3) of this rank's nodes, m (collective on the arm)."""
@@ -516,7 +516,7 @@ def _radii(triangles: np.ndarray, x: float, rays: np.ndarray, arm: Arm) -> np.nd
     share = (x - a[:, :1]) / (b[:, :1] - a[:, :1])
     ends = (a + share * (b - a)).reshape(-1, 2, 3)[:, :, 1:]
     aside, along = ends @ np.array([-rays[:, 1], rays[:, 0]]), ends @ rays.T
-    found = np.empty(len(rays))
+    result = np.empty(len(rays))
     for k, ray in enumerate(rays):
         meets = (aside[:, 0, k] < 0.0) != (aside[:, 1, k] < 0.0)
         (s, t), (near, far) = aside[meets, :, k].T, along[meets, :, k].T
@@ -530,15 +530,15 @@ def _radii(triangles: np.ndarray, x: float, rays: np.ndarray, arm: Arm) -> np.nd
                 f"{apart.sum()} times, expected once: hollow arms have sections that are "
                 'star-shaped about the axis; close holes, or take hollow = "box" or "tube"'
             )
-        found[k] = radius[-1]
-    return found
+        result[k] = radius[-1]
+    return result
 
 
 def _check_room(hull: Hull, arm: Arm) -> None:
     """Raise InputError where the thickest wall would turn its inner surface over."""
     most = arm.wall_limits[1]
     inner = hull.outer + most * hull.inward
-    sides = [np.roll(one[:, :, 1:], -1, axis=1) - one[:, :, 1:] for one in (hull.outer, inner)]
+    sides = [np.roll(item[:, :, 1:], -1, axis=1) - item[:, :, 1:] for item in (hull.outer, inner)]
     turned = (sides[0] * sides[1]).sum(axis=2) <= 0.0
     if turned.any():
         i, j = np.argwhere(turned)[0]

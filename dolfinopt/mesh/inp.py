@@ -70,12 +70,12 @@ def _text(path: Path) -> str:
 
 def _regions(mesh: Abaqus) -> np.ndarray:
     """Return the group of every cell: of its element sets, or design."""
-    found = dict.fromkeys(mesh.cells, DESIGN)
+    result = dict.fromkeys(mesh.cells, DESIGN)
     for name, members in mesh.element_sets.items():
         group = group_named(name, PASSIVE, VOID)
         if group is not None:
-            found.update(dict.fromkeys(mesh.cells.keys() & set(members), group))
-    return np.array(list(found.values()))
+            result.update(dict.fromkeys(mesh.cells.keys() & set(members), group))
+    return np.array(list(result.values()))
 
 
 def _interface(mesh: Abaqus, outer: np.ndarray, group: int, arm: Arm) -> np.ndarray:
@@ -87,13 +87,15 @@ def _interface(mesh: Abaqus, outer: np.ndarray, group: int, arm: Arm) -> np.ndar
     def belongs(one: str) -> bool:
         return interface_named(one, arm) == group
 
-    facets = [facet for one in mesh.surfaces if belongs(one) for facet in facets_of(mesh, one)]
-    for one, members in mesh.element_sets.items():
-        if belongs(one):
+    facets = [
+        facet for surface in mesh.surfaces if belongs(surface) for facet in facets_of(mesh, surface)
+    ]
+    for item, members in mesh.element_sets.items():
+        if belongs(item):
             facets += [mesh.faces[number] for number in members if number in mesh.faces]
     if facets:
         return np.array(facets)
-    own = [node for one, members in mesh.node_sets.items() if belongs(one) for node in members]
+    own = [node for entry, members in mesh.node_sets.items() if belongs(entry) for node in members]
     within = outer[np.isin(outer, own).all(axis=1)]
     if not len(within):
         raise InputError(_missing(mesh, interface_names(arm)[group], group, bool(own)))

@@ -88,21 +88,23 @@ def no_groups(arm: Arm) -> Entities:
 
 def interface_names(arm: Arm) -> dict[int, str]:
     """Return the names of all interfaces by their groups."""
-    more = {FURTHER + k: one.name.strip() for k, one in enumerate(arm.further_interfaces)}
+    more = {
+        FURTHER + k: interface.name.strip() for k, interface in enumerate(arm.further_interfaces)
+    }
     return {INBOARD: NAMES[INBOARD], OUTBOARD: NAMES[OUTBOARD], **more}
 
 
 def bores_of(arm: Arm) -> dict[int, Interface]:
     """Return the bores that are interfaces by their groups; points in the file's frame, m."""
-    found = {
-        FURTHER + k: one
-        for k, one in enumerate(arm.further_interfaces)
-        if one.axis is not None and one.radius is not None
+    result = {
+        FURTHER + k: interface
+        for k, interface in enumerate(arm.further_interfaces)
+        if interface.axis is not None and interface.radius is not None
     }
     for group in (INBOARD, OUTBOARD):
         if (bore := arm.end_bore(NAMES[group])) is not None:
-            found[group] = bore
-    return found
+            result[group] = bore
+    return result
 
 
 def elements_of(gmsh: Any, dim: int, entities: Iterable[int]) -> np.ndarray:
@@ -158,10 +160,10 @@ def into_model(gmsh: Any, mesh: SolidCells, dim: int) -> Entities:
     number[used] = np.arange(1, len(used) + 1)
     places = mesh.points[used]
     places = np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
-    found: Entities = {group: [] for group in NAMES}
+    result: Entities = {group: [] for group in NAMES}
     for d, groups in ((dim, mesh.cells), (dim - 1, mesh.facets)):
         for group, rows in groups.items():
-            found[group] = []
+            result[group] = []
             if len(rows):
                 entity = model.addDiscreteEntity(d)
                 if len(places):  # the first one has them all
@@ -169,8 +171,8 @@ def into_model(gmsh: Any, mesh: SolidCells, dim: int) -> Entities:
                     places = places[:0]
                 kind = STRAIGHT[d, rows.shape[1]]
                 model.mesh.addElementsByType(entity, kind, [], number[rows].ravel())
-                found[group] = [entity]
-    return found
+                result[group] = [entity]
+    return result
 
 
 def placed(gmsh: Any, groups: Entities, arm: Arm) -> Entities:
@@ -208,8 +210,8 @@ def _of_bore(points: np.ndarray, outer: np.ndarray, bore: Interface, name: str) 
     apart = points - np.array(bore.point)
     distance = np.linalg.norm(apart - np.outer(apart @ axis, axis), axis=1)
     near = np.abs(distance - bore.radius) <= BORE_RADIUS_SHARE * bore.radius
-    found = outer[near[outer].all(axis=1)]
-    if not len(found):
+    result = outer[near[outer].all(axis=1)]
+    if not len(result):
         used = np.unique(outer)
         at = used[np.argmin(np.abs(distance[used] - bore.radius))]
         place = ", ".join(f"{x:.6g}" for x in points[at])
@@ -218,7 +220,7 @@ def _of_bore(points: np.ndarray, outer: np.ndarray, bore: Interface, name: str) 
             f"surface the one at ({place}) m comes next, {distance[at]:.6g} m from the axis; state "
             "point, axis and radius as the file has them, in m, and arms.mesh_scale"
         )
-    return np.asarray(found)
+    return np.asarray(result)
 
 
 # -- A closed surface of triangles, meshed with tetrahedra; cells as a solid arm's .msh file -----
@@ -247,7 +249,7 @@ class Tetrahedra:
     def volumes(self) -> np.ndarray:
         """Volumes (m,) of the cells, m3; negative of those turned over."""
         a, *rest = self.points[self.cells].swapaxes(0, 1)
-        b, c, d = (one - a for one in rest)
+        b, c, d = (item - a for item in rest)
         return np.asarray(np.einsum("na,na->n", b, np.cross(c, d)) / 6.0)
 
     @property
@@ -354,13 +356,13 @@ def _meshed(
     for group, own in chosen.items():
         if not own:
             raise InputError(f"the {NAMES[group]} interface is lost in its faces")
-    found = _cells(gmsh, solid, chosen)
-    volumes = found.volumes
+    result = _cells(gmsh, solid, chosen)
+    volumes = result.volumes
     a, b, c = points[triangles].swapaxes(0, 1)  # each with the origin a tetrahedron
     expected = np.einsum("na,na->", a, np.cross(b, c)) / 6.0
     if volumes.min() <= 0.0 or abs(volumes.sum() - expected) > LOST_VOLUME_SHARE * expected:
         raise InputError("its cells do not fill it")
-    return found
+    return result
 
 
 def _faces_of(
@@ -368,15 +370,15 @@ def _faces_of(
 ) -> list[int]:
     """Return the faces made of an interface's triangles (m,)."""
     own = {tuple(row) for row in np.sort(triangles[mark], axis=1) + 1}
-    found = []
+    result = []
     for face in faces:
         nodes = model.mesh.getElementsByType(TRIANGLE, face)[1].reshape(-1, 3).astype(int)
         inside = np.array([tuple(row) in own for row in np.sort(nodes, axis=1)], dtype=bool)
         a, b, c = points[nodes - 1].swapaxes(0, 1)
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
         if area[inside].sum() > 0.5 * area.sum():
-            found.append(face)
-    return found
+            result.append(face)
+    return result
 
 
 def _cells(gmsh: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahedra:
@@ -392,7 +394,7 @@ def _cells(gmsh: Any, solid: int, interfaces: dict[int, list[int]]) -> Tetrahedr
         number[np.concatenate([[], *(nodes_of(TRIANGLE, face)[1] for face in own)]).astype(int)]
         for own in (interfaces[group] for group in ENDS)
     ]
-    inboard, outboard = (one.reshape(-1, 3) for one in facets)
+    inboard, outboard = (facet.reshape(-1, 3) for facet in facets)
     return Tetrahedra(points[used], cells.reshape(-1, 4), inboard, outboard)
 
 

@@ -293,10 +293,10 @@ def target_of(t: np.ndarray, scene: Scene) -> Target:
 
 def _constants(scene: Scene) -> dict[str, float]:
     """Return coordinates that stay where they are: a fixed base, m, lengths of springs, m."""
-    found = {one.name: one.length or 0.0 for one in scene.rods if not one.driven}
+    result = {rod.name: rod.length or 0.0 for rod in scene.rods if not rod.driven}
     if not scene.is_spatial and scene.motion.base == "fixed":
-        found[CART] = scene.motion.base_position
-    return found
+        result[CART] = scene.motion.base_position
+    return result
 
 
 # -- chains of the plane ---------------------------------------------------------------------
@@ -368,7 +368,7 @@ def follower(scene: Scene) -> Follower:
         Task(
             constraints=constraints,
             names=tuple(units),
-            unknown=np.array([k for k, one in enumerate(units) if one not in given], dtype=int),
+            unknown=np.array([k for k, item in enumerate(units) if item not in given], dtype=int),
             passive=np.array(passive_coordinates(scene), dtype=int),
             target=lambda t: target_of(t, scene),
             guess=guess,
@@ -409,9 +409,9 @@ def build_mechanism(scene: Scene, bodies: Sequence[ShapeIntegrals]) -> Mechanism
     """Return the scene's machine, of bodies in the order of its arms."""
     friction = friction_of(scene, soft=False)
     bearings = {
-        k: bearing_body(one.bearing[0], one.bearing[1], scene.dimension)
-        for k, one in enumerate(joint_parts(scene))
-        if one.bearing is not None
+        k: bearing_body(part.bearing[0], part.bearing[1], scene.dimension)
+        for k, part in enumerate(joint_parts(scene))
+        if part.bearing is not None
     }
     mechanism = _tree(scene, bodies, _loads(scene), friction if friction.acts else None)
     return with_bearings(mechanism, bearings)
@@ -423,7 +423,9 @@ def skeleton(scene: Scene) -> Mechanism:
         return _tree(scene, [rigid_bar(arm.length, arm.height, 0.0, 0.0) for arm in scene.arms], {})
     points = [arm.interface_points for arm in scene.arms]
     none = np.zeros(3), np.zeros(6)
-    return _tree(scene, [rigid_spatial_body(0.0, *none, one[0], one[1:]) for one in points], {})
+    return _tree(
+        scene, [rigid_spatial_body(0.0, *none, point[0], point[1:]) for point in points], {}
+    )
 
 
 def _tree(
@@ -480,14 +482,14 @@ def _tensor(inertia: float | Inertia) -> Inertia:
 
 def _loads(scene: Scene) -> dict[Site, Constants]:
     """Return what the arms carry at interfaces without a joint: motors and the payload."""
-    payload, found = scene.payload, {}
+    payload, result = scene.payload, {}
     inertia = payload.inertia if scene.is_spatial else payload.moment
-    found[scene.end_effector] = _carried(scene, payload.mass, inertia, payload.offset)
+    result[scene.end_effector] = _carried(scene, payload.mass, inertia, payload.offset)
     for k, arm in enumerate(scene.arms):
         if arm.joint_mass or arm.joint_inertia:
             motor = _carried(scene, arm.joint_mass, arm.joint_inertia)
-            found[k, 0] = motor + found[k, 0] if (k, 0) in found else motor
-    return {site: Constants(body) for site, body in found.items()}
+            result[k, 0] = motor + result[k, 0] if (k, 0) in result else motor
+    return {site: Constants(body) for site, body in result.items()}
 
 
 def _carried(
@@ -534,26 +536,26 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
 
 def friction_of(scene: Scene, soft: bool) -> Friction:
     """Return the friction (R,) of joints, or of the motors before `soft` gears."""
-    found = Friction.none(scene.num_rigid)
-    for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True):
-        if k is not None and one.friction is not None and (one.stiffness > 0.0) == soft:
-            found.viscous[k], found.coulomb[k], found.speed[k] = one.friction
-    return found
+    result = Friction.none(scene.num_rigid)
+    for k, part in zip(scene.joint_columns, joint_parts(scene), strict=True):
+        if k is not None and part.friction is not None and (part.stiffness > 0.0) == soft:
+            result.viscous[k], result.coulomb[k], result.speed[k] = part.friction
+    return result
 
 
 def soft_joints(scene: Scene) -> dict[int, JointParts]:
     """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
     pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
-    found = {k: one for k, one in pairs if k is not None and one.stiffness > 0.0}
-    return dict(sorted(found.items()))
+    result = {k: item for k, item in pairs if k is not None and item.stiffness > 0.0}
+    return dict(sorted(result.items()))
 
 
 def rotors_of(scene: Scene) -> list[Rotor | None]:
     """Return the rotor of every arm's joint: behind a gear's spring a motor of its own."""
     motors: dict[int | None, int] = {k: place for place, k in enumerate(soft_joints(scene))}
     return [
-        Rotor(one.rotor, one.ratio, motors.get(k)) if k in motors or one.rotor > 0.0 else None
-        for k, one in zip(scene.joint_columns, joint_parts(scene), strict=True)
+        Rotor(part.rotor, part.ratio, motors.get(k)) if k in motors or part.rotor > 0.0 else None
+        for k, part in zip(scene.joint_columns, joint_parts(scene), strict=True)
     ]
 
 
@@ -565,14 +567,17 @@ def loops_of(scene: Scene) -> Loops | None:
     if not scene.closures:
         return None
     d, reach, first = scene.dimension, skeleton(scene).reach, len(scene.movable)
-    places = {one.name: first + k for k, one in enumerate(scene.rods)}
+    places = {rod.name: first + k for k, rod in enumerate(scene.rods)}
     ties = []
-    for one in scene.closures:
-        a, b = (place_of(scene, end) for end in one.between)
+    for closure in scene.closures:
+        a, b = (place_of(scene, end) for end in closure.between)
         assert a is not None
-        equations = _equations(one, d, reach, places.get(one.name))
-        point, rotation = np.array(one.point[:d], dtype=float), roll_pitch_yaw(one.rpy)[:d, :d]
-        ties.append(Tie(one.name, a, b, point, rotation, equations))
+        equations = _equations(closure, d, reach, places.get(closure.name))
+        point, rotation = (
+            np.array(closure.point[:d], dtype=float),
+            roll_pitch_yaw(closure.rpy)[:d, :d],
+        )
+        ties.append(Tie(closure.name, a, b, point, rotation, equations))
     return Loops(tuple(ties))
 
 
@@ -585,22 +590,26 @@ FACING = {
 }
 
 
-def _equations(one: Closures, d: int, reach: float, place: int | None) -> tuple[Equation, ...]:
+def _equations(closure: Closures, d: int, reach: float, place: int | None) -> tuple[Equation, ...]:
     """Return a closure's equations; vectors of the second frame are in the joint's."""
-    if one.kind == "rod":
-        return (Distance(0.0 if place is not None else one.length or 0.0, place),)
-    frame = np.eye(d) if one.kind == "ball" or (d == 2 and one.kind == "pin") else _frame(one, d)
-    lines = frame[1:] if one.kind == "slider" else np.eye(d)
-    pairs = FACING[one.kind] if d == 3 else ()
+    if closure.kind == "rod":
+        return (Distance(0.0 if place is not None else closure.length or 0.0, place),)
+    frame = (
+        np.eye(d)
+        if closure.kind == "ball" or (d == 2 and closure.kind == "pin")
+        else _frame(closure, d)
+    )
+    lines = frame[1:] if closure.kind == "slider" else np.eye(d)
+    pairs = FACING[closure.kind] if d == 3 else ()
     return (*map(Along, lines), *(Facing(frame[i], frame[j], reach) for i, j in pairs))
 
 
-def _frame(one: Closures, d: int) -> np.ndarray:
+def _frame(closure: Closures, d: int) -> np.ndarray:
     """Return the direction of a closure's axis and those across it (d, d), a row each."""
-    axis = _unit((one.axis or ())[:d])
+    axis = _unit((closure.axis or ())[:d])
     if d == 2:
         return np.array([axis, [-axis[1], axis[0]]])
-    across = _unit(one.cross_axis or np.cross(axis, ONE[int(np.argmin(np.abs(axis)))]))
+    across = _unit(closure.cross_axis or np.cross(axis, ONE[int(np.argmin(np.abs(axis)))]))
     return np.array([axis, across, np.cross(axis, across)])
 
 

@@ -83,9 +83,9 @@ class Follower:
         samples, ahead = [(t, q, qd[0])], list(map(float, self._instants[:0:-1]))
         while ahead:
             h = ahead[-1] - t
-            found = self._reached(q + h * qd[0] + 0.5 * h * h * qdd[0], ahead[-1], G)
-            if found is not None:
-                t, (q, qd, qdd, G) = ahead.pop(), found
+            result = self._reached(q + h * qd[0] + 0.5 * h * h * qdd[0], ahead[-1], G)
+            if result is not None:
+                t, (q, qd, qdd, G) = ahead.pop(), result
                 samples.append((t, q, qd[0]))
             elif h > 1e-6 * task.end:  # behind a shorter step there is no continuation
                 ahead.append(t + 0.5 * h)

@@ -89,15 +89,15 @@ class Curve:
     def __call__(self, u: np.ndarray) -> Values:
         """Return the curve and two derivatives (n, k) at parameters (n,)."""
         here = self.rows[np.maximum(np.searchsorted(self.u, u, side="right") - 1, 0)]
-        found = here, np.zeros_like(here), np.zeros_like(here)
+        result = here, np.zeros_like(here), np.zeros_like(here)
         beyond = SAME * self.end if self.ends_move else 0.0
         for i, j, function in self.moves:
             first, last = self.u[i], self.u[j]
             inside = (first - beyond < u) & (u < last + beyond)
             parts = function(np.clip(u[inside], first, last))
-            for values, part in zip(found, parts, strict=True):
+            for values, part in zip(result, parts, strict=True):
                 values[inside] = part
-        return found
+        return result
 
 
 def moves(rows: np.ndarray) -> list[tuple[int, int]]:
@@ -122,7 +122,7 @@ def curve_in_time(table: Table, moving: bool = False) -> Curve:
     from scipy.interpolate import make_interp_spline  # takes as long to import as NumPy
 
     assert table.t is not None
-    found, degree = [], 5
+    result, degree = [], 5
     for i, j in moves(table.rows):
         t, rows = table.t[i : j + 1], table.rows[i : j + 1]
         rates = np.zeros((2, 2, rows.shape[1]))  # speed and acceleration; first and last instant
@@ -131,8 +131,8 @@ def curve_in_time(table: Table, moving: bool = False) -> Curve:
             free = [i == 0, j == len(table.t) - 1]
             rates[:, free] = _values_of(make_interp_spline(t, rows, k=own))(t[[0, -1]])[1:][:, free]
         ends = tuple([(1, v), (2, a)] for v, a in zip(*rates, strict=True))
-        found.append((i, j, _values_of(make_interp_spline(t, rows, k=degree, bc_type=ends))))
-    return Curve(table.t, table.rows, tuple(found), ends_move=moving)
+        result.append((i, j, _values_of(make_interp_spline(t, rows, k=degree, bc_type=ends))))
+    return Curve(table.t, table.rows, tuple(result), ends_move=moving)
 
 
 def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
@@ -148,8 +148,8 @@ def curve_by_laws(table: Table, laws: Sequence[tuple[int, int, Law]]) -> Curve:
         return values
 
     knots = [x for i, j, law in laws for x in t[i] + law.knots * (t[j] - t[i])]
-    found = tuple((i, j, straight(i, j, law)) for i, j, law in laws)
-    return Curve(t, rows, found, tuple(knots))
+    result = tuple((i, j, straight(i, j, law)) for i, j, law in laws)
+    return Curve(t, rows, result, tuple(knots))
 
 
 def curve_by_chord(table: Table, measured: int | None = None) -> Curve:

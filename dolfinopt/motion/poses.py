@@ -20,8 +20,8 @@ VECTOR = ("rx", "ry", "rz")
 
 def orientations(kind: tuple[str, ...], rows: np.ndarray) -> np.ndarray:
     """Return rotations (n, 3, 3) of rows (n, 3) of `RPY` about fixed axes, or of `VECTOR`, rad."""
-    found = Rotation.from_rotvec(rows) if kind == VECTOR else Rotation.from_euler("xyz", rows)
-    matrices: np.ndarray = found.as_matrix()
+    result = Rotation.from_rotvec(rows) if kind == VECTOR else Rotation.from_euler("xyz", rows)
+    matrices: np.ndarray = result.as_matrix()
     return matrices
 
 
@@ -48,6 +48,10 @@ def turning(start: np.ndarray, vectors: Sequence[np.ndarray]) -> Values:
         start: R_0 (3, 3).
         vectors: theta (n, 3) and two time derivatives.
     """
-    one = SpaceTurning(*(x.T for x in vectors))
+    space_turning = SpaceTurning(*(x.T for x in vectors))
     back = start.T
-    return start @ one.R.transpose(2, 0, 1), one.velocity.T @ back, one.acceleration.T @ back
+    return (
+        start @ space_turning.R.transpose(2, 0, 1),
+        space_turning.velocity.T @ back,
+        space_turning.acceleration.T @ back,
+    )

@@ -42,18 +42,18 @@ class Regularity:
             raise self.refusal(q[wrong[0]], float(t[wrong[0]]))
         for i, j in self._suspects(samples, sizes):
             near = CubicHermiteSpline(*samples)
-            found = minimize_scalar(
+            result = minimize_scalar(
                 lambda t, j=j, near=near: self.sizes(near(t)[None])[0, j],
                 bounds=t[i : i + 2],
                 method="bounded",
             )
-            if found.fun < SINGULAR_SHARE:
-                raise self.refusal(near(found.x), float(found.x))
+            if result.fun < SINGULAR_SHARE:
+                raise self.refusal(near(result.x), float(result.x))
 
     def on_one_side(self, a: np.ndarray, b: np.ndarray) -> bool:
         """Return whether two poses, by their G (1, k, R), have no singular position between."""
         pairs = zip(self._matrices(a), self._matrices(b), strict=True)
-        return all(np.linalg.det(one[0].T @ other[0]) > 0.0 for (one, _), (other, _) in pairs)
+        return all(np.linalg.det(item[0].T @ other[0]) > 0.0 for (item, _), (other, _) in pairs)
 
     def sizes(self, q: np.ndarray) -> np.ndarray:
         """Return smallest singular values at poses (n, R) over those of a usual pose (n, m)."""
@@ -65,10 +65,10 @@ class Regularity:
     def _matrices(self, G: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the m parts (n, k, u) of G that must stay regular, with their columns."""
         task = self.task
-        found = [(G[:, :, task.unknown], task.unknown)]
+        result = [(G[:, :, task.unknown], task.unknown)]
         if task.constraints.has_path and len(task.passive):
-            found.append((G[:, : task.constraints.loops.count, task.passive], task.passive))
-        return found
+            result.append((G[:, : task.constraints.loops.count, task.passive], task.passive))
+        return result
 
     # -- between samples -------------------------------------------------------------------------
 

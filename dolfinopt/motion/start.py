@@ -77,14 +77,14 @@ def nearest(
     if len(free) == 0:
         off = np.linalg.norm(constraints.at(q[None]).error(target)[0, rows])
         return q, float(off)
-    found = least_squares(
+    result = least_squares(
         error,
         np.zeros(len(free)),
         jacobian,
         method="lm",
         **dict.fromkeys(("xtol", "ftol", "gtol"), np.finfo(float).eps),
     )
-    return pose(found.x)[0], float(np.linalg.norm(found.fun)) * constraints.reach
+    return pose(result.x)[0], float(np.linalg.norm(result.fun)) * constraints.reach
 
 
 def start_of(task: Task) -> Start:

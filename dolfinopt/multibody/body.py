@@ -203,8 +203,8 @@ class BodyMotion:
         first = np.ascontiguousarray(np.moveaxis(by, -1, 0))
         if self.constants.bent is None:
             own = self.constants.by_e[places][:, kept]
-            found = first.reshape(-1, len(own)) @ own
-            return found.reshape(*first.shape[:3], -1).swapaxes(2, 3)
+            result = first.reshape(-1, len(own)) @ own
+            return result.reshape(*first.shape[:3], -1).swapaxes(2, 3)
         return _chain([first[:, :, r] for r in range(3)], self._by_rates(places, kept))
 
     # -- integrals of the deformed body ------------------------------------------------------
@@ -244,8 +244,8 @@ class BodyMotion:
             none = np.zeros_like(self.alpha)
             return none + rest, none, none
         v = self.conjugates[d : d + g]
-        found = np.einsum("ckrn,kn->crn", self._Wz, self.z[:, 0]) + self.dim.transposed(v)
-        return rest + v[:, 0] + found[:, 0], found[:, 1], found[:, 2]
+        result = np.einsum("ckrn,kn->crn", self._Wz, self.z[:, 0]) + self.dim.transposed(v)
+        return rest + v[:, 0] + result[:, 0], result[:, 1], result[:, 2]
 
     # -- forces ------------------------------------------------------------------------------
 
@@ -327,8 +327,8 @@ class BodyMotion:
             virtual: (d + r, n) multiplies (F, T).
             zeta: (q, n) multiplies the rows.
         """
-        found = product(self.load_by_motion.swapaxes(0, 1), virtual)
-        return found + product(self.rows_by_motion, zeta) if self.is_flexible else found
+        result = product(self.load_by_motion.swapaxes(0, 1), virtual)
+        return result + product(self.rows_by_motion, zeta) if self.is_flexible else result
 
     @cached_property
     def rows_by_motion(self) -> np.ndarray:
@@ -417,8 +417,8 @@ class BodyMotion:
         every = np.zeros((len(constants.by_e), 4, zeta.shape[1]))
         every[constants.inertial, :3] = self._inertia_gradient(virtual)
         every[:d, 3], every[d:ends, 3] = self.a, self.alpha
-        for s, one in outboard.items():
-            every[constants.outboard(s)] = one
+        for s, item in outboard.items():
+            every[constants.outboard(s)] = item
         x = np.concatenate([self.rates, zeta[:, None]], axis=1)
         by_T = np.tensordot(every[:P], x, ((1, 2), (1, 2)))
         W = np.zeros_like(body.W)
@@ -467,8 +467,8 @@ class BodyMotion:
         y = self.accelerations
         left = np.concatenate([self._virtual_z(zeta), self.z[:, 0]], axis=1)
         right = np.concatenate([y, self.dim.turned(phi, y)], axis=2)
-        found: np.ndarray = left @ right.swapaxes(1, 2)  # of N_l' E_c N_k: l, k
-        return found
+        result: np.ndarray = left @ right.swapaxes(1, 2)  # of N_l' E_c N_k: l, k
+        return result
 
     def _add_modal(self, every: np.ndarray, zeta: np.ndarray) -> None:
         """Add the derivatives of the rows' work by z, its rates and variation (q, 4, n)."""
@@ -482,9 +482,9 @@ class BodyMotion:
         """Return the derivative by K0 and L (., q, q), of which the symmetric part counts."""
         e, ed = x[:, 0], x[:, 1]
         half = x * np.array([0.5, 1.0, 1.0, 1.0])[:, None]
-        found = e @ np.einsum("prn,krn->pnk", every, half)
-        found += ed @ (every[:, 2, :, None] * ed.T)
-        return np.asarray(-found)
+        result = e @ np.einsum("prn,krn->pnk", every, half)
+        result += ed @ (every[:, 2, :, None] * ed.T)
+        return np.asarray(-result)
 
 
 def by_instant(x: np.ndarray) -> np.ndarray:

@@ -167,7 +167,7 @@ class Tie:
     @property
     def units(self) -> tuple[str, ...]:
         """Unit of every equation's force or moment."""
-        return tuple("N m" if isinstance(one, Facing) else "N" for one in self.equations)
+        return tuple("N m" if isinstance(equation, Facing) else "N" for equation in self.equations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,12 +188,17 @@ class Loops:
     @cached_property
     def equations(self) -> tuple[Equation, ...]:
         """Those of all closures."""
-        return tuple(one for tie in self.ties for one in tie.equations)
+        return tuple(equation for tie in self.ties for equation in tie.equations)
 
     @cached_property
     def lengths(self) -> np.ndarray:
         """By what (k,) a multiplier is a moment, m; 1 of forces."""
-        return np.array([one.length if isinstance(one, Facing) else 1.0 for one in self.equations])
+        return np.array(
+            [
+                equation.length if isinstance(equation, Facing) else 1.0
+                for equation in self.equations
+            ]
+        )
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
         """Return every closure's part of values (..., k) of the equations."""
@@ -227,15 +232,15 @@ class ClosedTie:
     @cached_property
     def loads(self) -> np.ndarray:
         """Loads of the m equations on both frames (2 b, m, n)."""
-        return np.stack([one.loads(*self.sites) for one in self.equations], axis=1)
+        return np.stack([equation.loads(*self.sites) for equation in self.equations], axis=1)
 
     @property
     def jacobian(self) -> np.ndarray:
         """Derivatives of the equations by all coordinates (n, m, C)."""
         out: np.ndarray = np.einsum("bmn,bcn->nmc", self.loads, self.by)
-        for k, one in enumerate(self.equations):
-            if isinstance(one, Distance) and one.coordinate is not None:
-                out[:, k, one.coordinate] -= 1.0
+        for k, equation in enumerate(self.equations):
+            if isinstance(equation, Distance) and equation.coordinate is not None:
+                out[:, k, equation.coordinate] -= 1.0
         return out
 
     def loads_of(self, multipliers: np.ndarray) -> list[np.ndarray]:
@@ -245,7 +250,7 @@ class ClosedTie:
     def changes(self, multipliers: np.ndarray, moved: np.ndarray) -> np.ndarray:
         """Return how these change by moves of both frames (2 b, ., n)."""
         pairs = zip(multipliers.T, self.equations, strict=True)
-        return np.sum([w * one.changes(*self.sites, moved) for w, one in pairs], axis=0)
+        return np.sum([w * item.changes(*self.sites, moved) for w, item in pairs], axis=0)
 
     def along(self, virtual: np.ndarray) -> np.ndarray:
         """Return how both frames move by virtual coordinates (2 b, 1, n)."""
@@ -254,9 +259,9 @@ class ClosedTie:
     def hessian(self, multipliers: np.ndarray) -> np.ndarray:
         """Return the derivative of the generalised force by all coordinates (n, C, C)."""
         changed = self.changes(multipliers, self.by)
-        found: np.ndarray = np.einsum("bjn,bin->nji", self.by, changed)
+        result: np.ndarray = np.einsum("bjn,bin->nji", self.by, changed)
         pairs = zip(self.sites, self.loads_of(multipliers), strict=True)
-        return found + sum(site.hessian(load) for site, load in pairs if site.way)
+        return result + sum(site.hessian(load) for site, load in pairs if site.way)
 
     def acceleration(self, rates: np.ndarray) -> np.ndarray:
         """Return what rates (n, R) of rigid bodies add to the second derivatives (n, m), m/s2.
@@ -264,7 +269,9 @@ class ClosedTie:
         The power g' of unit loads on moving frames, differentiated.
         """
         v, bias = self.along(rates), [x for site in self.sites for x in site.acceleration(rates)]
-        turned = np.concatenate([one.changes(*self.sites, v) for one in self.equations], axis=1)
+        turned = np.concatenate(
+            [equation.changes(*self.sites, v) for equation in self.equations], axis=1
+        )
         power = turned * v + self.loads * np.concatenate(bias)[:, None]
         return np.asarray(power.sum(axis=0).T)
 
@@ -286,7 +293,7 @@ class ClosedLoops:
     @cached_property
     def gap(self) -> np.ndarray:
         """The equations (n, k), m."""
-        rows = [one.value(*tie.sites) for tie in self.ties for one in tie.equations]
+        rows = [equation.value(*tie.sites) for tie in self.ties for equation in tie.equations]
         return np.reshape(rows, (len(rows), len(self.posed.q))).T
 
     @cached_property
@@ -313,14 +320,14 @@ class ClosedLoops:
 
     def interface_loads(self, multipliers: np.ndarray) -> dict[Site, np.ndarray]:
         """Return what interfaces give to the closures, force and moment in their components."""
-        found: dict[Site, np.ndarray] = {}
+        result: dict[Site, np.ndarray] = {}
         for tie, part in self._each(multipliers):
             for site, load in zip(tie.sites, tie.loads_of(part), strict=True):
                 if site.way:
                     end = site.way[-1]
                     own = site.load_on(*self.posed.interface(*end), -load)
-                    found[end] = own + found[end] if end in found else own
-        return found
+                    result[end] = own + result[end] if end in result else own
+        return result
 
     def _each(self, multipliers: np.ndarray) -> Iterator[tuple[ClosedTie, np.ndarray]]:
         """Return every closure and its part of multipliers (n, k)."""
@@ -347,10 +354,10 @@ class ClosedLoops:
         Returns:
             Of every body, by its outboard modes (b, q) and K0_outboard (b, q, q).
         """
-        found = no_gradient(self.posed.mechanism)
+        result = no_gradient(self.posed.mechanism)
         for (tie, part), own in zip(self._each(multipliers), self.loops.split(weights)):
             changed = np.split(tie.changes(part, tie.along(virtual))[:, 0], 2)
             loads = tie.loads_of(own), tie.loads_of(part), changed
             for site, weight, load, change in zip(tie.sites, *loads, strict=True):
-                site.add_gradient(found, weight, load, change, virtual)
-        return found
+                site.add_gradient(result, weight, load, change, virtual)
+        return result

@@ -56,8 +56,8 @@ class Bilinear:
 
     def matrix(self, x: np.ndarray) -> np.ndarray:
         """Return its derivative by y (i, k, ..., n), of T's first axes as one."""
-        found = self._by_x.dot(x.reshape(len(x), -1))
-        return found.reshape(self._rows, self._shape[-1], *x.shape[1:])
+        result = self._by_x.dot(x.reshape(len(x), -1))
+        return result.reshape(self._rows, self._shape[-1], *x.shape[1:])
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return its value."""
@@ -331,10 +331,10 @@ def series(x: np.ndarray, orders: int = 8) -> list[np.ndarray]:
 def _closed(x: np.ndarray, orders: int) -> list[np.ndarray]:
     """Return c_0 = cos(angle), c_1 = sin(angle) / angle, c_(k+2) = (1 / k! - c_k) / x."""
     angle = np.sqrt(x)
-    found = [np.cos(angle), np.sin(angle) / angle]
+    result = [np.cos(angle), np.sin(angle) / angle]
     for k in range(orders - 2):
-        found.append((1.0 / factorial(k) - found[k]) / x)
-    return found
+        result.append((1.0 / factorial(k) - result[k]) / x)
+    return result
 
 
 def _series(x: np.ndarray, orders: int) -> list[np.ndarray]:
@@ -343,10 +343,10 @@ def _series(x: np.ndarray, orders: int) -> list[np.ndarray]:
     for j in range(SERIES_TERMS - 1, -1, -1):
         first = [1.0 / factorial(2 * j + k) for k in (orders - 1, orders - 2)]
         last = np.reshape(first, column) - x * last
-    found = list(last)
+    result = list(last)
     for k in range(orders - 3, -1, -1):
-        found.append(1.0 / factorial(k) - x * found[-2])
-    return found[::-1]
+        result.append(1.0 / factorial(k) - x * result[-2])
+    return result[::-1]
 
 
 def _derivative(c: list[np.ndarray], k: int) -> np.ndarray:

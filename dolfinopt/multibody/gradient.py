@@ -117,9 +117,9 @@ def _by_rotation(
 ) -> dict[Site, np.ndarray]:
     """Return the derivatives by every interface's theta (r, n) through forces of the world."""
     # What turns a body turns such a force the other way in the body's components.
-    found: dict[Site, np.ndarray] = {}
+    result: dict[Site, np.ndarray] = {}
     if not tree.forces:
-        return found
+        return result
     dim, of_bodies = tree.dim, dict.fromkeys(range(len(links)), np.zeros((tree.dim.r, 1)))
     for i in reversed(tree.order):
         link, own = links[i], zeta[tree.slices[i]]
@@ -131,14 +131,14 @@ def _by_rotation(
             )
             if link.body.is_flexible:
                 turned = dim.rotated(interface.turning.R, turned)
-                found[i, s] = interface.turning.jacobian_transposed(turned)
+                result[i, s] = interface.turning.jacobian_transposed(turned)
             total += turned
             if s in link.applied:
                 given, moved = link.applied[s].in_world, _virtual(interface, moves[i], own)
                 total -= dim.moment(given[: dim.d], moved[: dim.d])
                 total -= dim.commutator(given[dim.d :], moved[dim.d :])
         of_bodies[i] = total
-    return found
+    return result
 
 
 def _virtual_motion(

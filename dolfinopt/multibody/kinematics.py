@@ -172,8 +172,8 @@ class SiteMotion:
 
     def turned(self, v: np.ndarray) -> np.ndarray:
         """Return a vector (d,) that is fixed to the frame in the ground's components (d, n)."""
-        found = product(self.R, v[:, None])
-        return np.broadcast_to(found, (self.dim.d, len(self.posed.q)))
+        result = product(self.R, v[:, None])
+        return np.broadcast_to(result, (self.dim.d, len(self.posed.q)))
 
     def along(self, virtual: np.ndarray) -> np.ndarray:
         """Return displacement and rotation (d + r, n) by virtual coordinates (n, C)."""
@@ -206,32 +206,32 @@ class SiteMotion:
         inboard = on_way & (order[None] < order[:, None])  # [j, i]: i is inboard of j
         pulled = dim.moment(self.by_place, force[:, None])
         by_force = np.einsum("rjn,rin->nji", pulled, s)
-        found = np.where(inboard, by_force, 0.0)
-        found = found + found.swapaxes(1, 2)
+        result = np.where(inboard, by_force, 0.0)
+        result = result + result.swapaxes(1, 2)
         joints = np.flatnonzero(on_way & (np.arange(len(order)) < self.posed.mechanism.num_rigid))
-        found[:, joints, joints] += by_force[:, joints, joints]
+        result[:, joints, joints] += by_force[:, joints, joints]
         if dim.r > 1:
             turned = dim.commutator(s, moment[:, None])
-            found += np.where(inboard, np.einsum("rjn,rin->nji", turned, s), 0.0)
+            result += np.where(inboard, np.einsum("rjn,rin->nji", turned, s), 0.0)
         for link in self.flexible:
-            found[:, link.columns, link.columns] += self._own_hessian(link, load)
-        return found
+            result[:, link.columns, link.columns] += self._own_hessian(link, load)
+        return result
 
     def _own_hessian(self, link: FlexibleLink, load: np.ndarray) -> np.ndarray:
         """Return the part (n, q, q) of one body's own deformation."""
         dim, d, spin = self.dim, self.dim.d, self.by_spin[:, link.columns]
         swung = dim.velocity(spin, (self.place - link.place)[:, None])
         pulled = dim.moment(swung, load[:d, None])
-        found = np.einsum("rkn,rln->nkl", spin, pulled)
+        result = np.einsum("rkn,rln->nkl", spin, pulled)
         by_theta = link.turning.by_theta(self._on_interface(link, load)[d:], -1.0)
         if by_theta is not None:
             theta = np.broadcast_to(link.section.V[d:], (dim.r, *spin.shape[1:]))
-            found += np.einsum("akn,abn,bln->nkl", theta, by_theta, theta, optimize=True)
+            result += np.einsum("akn,abn,bln->nkl", theta, by_theta, theta, optimize=True)
         constants = self.posed.mechanism.constants[link.body]
         if constants.bent is not None:
             bent = constants.bent[constants.outboard(link.number)]
-            found -= np.einsum("pn,pkl->nkl", self.interface_load(link, load), bent)
-        return found
+            result -= np.einsum("pn,pkl->nkl", self.interface_load(link, load), bent)
+        return result
 
     def load_on(self, point: np.ndarray, R: np.ndarray, load: np.ndarray) -> np.ndarray:
         """Return force and moment about a point (d, n) in the components of a frame."""

@@ -46,12 +46,12 @@ def _loaded_links(
     mechanism: Mechanism, motion: RigidMotion, rates: Rates, pull: Mapping[Site, np.ndarray]
 ) -> list[tuple[Link, np.ndarray]]:
     links = outward_pass(mechanism, motion, rates, pull)
-    found = []
+    result = []
     for link, loads in zip(links, inward_pass(mechanism, links, pull=pull).outboard, strict=True):
         pulls = interface_coefficients(link, loads) if link.body.is_flexible else loads
         p, order = link.body.load_coefficients(pulls), link.body.dim.loads
-        found.append((link, np.concatenate([p[order], p[len(order) :]]).T))
-    return found
+        result.append((link, np.concatenate([p[order], p[len(order) :]]).T))
+    return result
 
 
 def is_loaded_at_rest(mechanism: Mechanism, motion: RigidMotion) -> bool:
@@ -73,11 +73,11 @@ def load_coefficients(
     c = -(p, alpha_c z + beta_c z' + trace_c z''), p of `body_loads`, c before the modes, z being
     the displacement along them, see `body`. `pull` is that of `body_loads`.
     """
-    found = []
+    result = []
     for link, p in _loaded_links(mechanism, motion, rates, pull):
         elastic = link.body.accelerations.reshape(-1, len(p))
-        found.append(-np.hstack([p, elastic.T]))
-    return found
+        result.append(-np.hstack([p, elastic.T]))
+    return result
 
 
 # -- how much the loads of a motion stiffen or soften the arms, before anything is simulated -----

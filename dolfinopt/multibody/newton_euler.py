@@ -89,10 +89,10 @@ def outward_pass(
         if i in tree.rotors:
             rotor = MovingRotor(joint, inner, _motor_rates(tree, motion, i))
         links[i] = Link(moving, body, interfaces, carried, {}, rotor)
-    found = [links[i] for i in range(len(links))]
+    result = [links[i] for i in range(len(links))]
     if tree.forces:
-        _apply_forces(tree, found, motion, rates[0])
-    return found
+        _apply_forces(tree, result, motion, rates[0])
+    return result
 
 
 def _motor_rates(tree: Mechanism, motion: RigidMotion, i: int) -> np.ndarray:
@@ -164,7 +164,7 @@ def inward_pass(
             hanging = tree.hanging.get((i, s), ())
             on_it = [links[k] for k in hanging]
             parts = [links[k].joint.load_on_carrier(joints[k]) for k in hanging]
-            parts += [one.rotor.load for one in on_it if one.rotor is not None]
+            parts += [item.rotor.load for item in on_it if item.rotor is not None]
             if s in link.carried:
                 parts.append(link.carried[s].load)
             if (i, s) in pull:
@@ -175,7 +175,7 @@ def inward_pass(
             outboard[i][s] = sum(loads[1:], loads[0])
         if felt:
             places = ((link.interfaces[s].place, load) for s, load in outboard[i].items())
-            joints[i] = sum((tree.dim.shifted(*one) for one in places), link.body.load)
+            joints[i] = sum((tree.dim.shifted(*place) for place in places), link.body.load)
     return Loads(outboard, joints)
 
 

@@ -138,11 +138,11 @@ class ShapeIntegrals:
     def in_basis(self, T: np.ndarray) -> ShapeIntegrals:
         """Return the body in the coordinates z with q = T z; T is (q, q')."""
         changed: dict[str, Any] = {}
-        for one in TABLE:
-            if one.modes:
-                first = 1 if one.rigid else 0
-                value = getattr(self, one.name)
-                changed[one.name] = _transformed(value, T, len(one.modes), first)
+        for item in TABLE:
+            if item.modes:
+                first = 1 if item.rigid else 0
+                value = getattr(self, item.name)
+                changed[item.name] = _transformed(value, T, len(item.modes), first)
         return replace(self, **changed)
 
     @property
@@ -178,7 +178,7 @@ def scaled(body: ShapeIntegrals, mass: float, stiffness: float, damping: float) 
 
 def integrals_of(body: ShapeIntegrals) -> dict[str, Any]:
     """Return all integrals, or derivatives by them, under their names."""
-    return {one.name: getattr(body, one.name) for one in TABLE}
+    return {item.name: getattr(body, item.name) for item in TABLE}
 
 
 def add_integrals(body: ShapeIntegrals, more: Mapping[str, Any]) -> ShapeIntegrals:
@@ -285,8 +285,8 @@ def integrated(
         rigid[:, 0, 0].sum(),
         MX.sum(axis=0),
         MV.sum(axis=0),
-        np.array([np.sum(one * MX) for one in EX]),
-        np.array([np.einsum("ni,nik->k", one, MV) for one in EX]),
+        np.array([np.sum(item * MX) for item in EX]),
+        np.array([np.einsum("ni,nik->k", item, MV) for item in EX]),
         MV_flat.T @ EV,
     )
     mass, moment, C, second, first, modes = map(arm.comm.allreduce, parts)

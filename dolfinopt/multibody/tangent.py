@@ -64,14 +64,14 @@ class Tangent:
         change = np.empty((*q.shape, 3))
         change[:, self.order] = np.stack([q, qd, qdd], axis=2)
         change = change.reshape(len(self.matrix), -1, 3 * q.shape[1])
-        found = change @ self._flat.swapaxes(1, 2)
-        return found.reshape(len(q), -1)[:, wanted]
+        result = change @ self._flat.swapaxes(1, 2)
+        return result.reshape(len(q), -1)[:, wanted]
 
     def transposed(self, rows: np.ndarray) -> Rates:
         """Return the gradient of sum_m rows_m . residual_m by q, qd, qdd, each (m, S)."""
-        found = rows.reshape(len(self.matrix), -1, rows.shape[1]) @ self._flat
-        found = found.reshape(len(rows), -1, 3)[:, self.order]
-        return found[:, :, 0], found[:, :, 1], found[:, :, 2]
+        result = rows.reshape(len(self.matrix), -1, rows.shape[1]) @ self._flat
+        result = result.reshape(len(rows), -1, 3)[:, self.order]
+        return result[:, :, 0], result[:, :, 1], result[:, :, 2]
 
 
 def linearise(
@@ -97,13 +97,13 @@ def linearise(
     asked = np.zeros(0, dtype=int) if rigid is None else rigid
     keep = np.arange(tree.num_coordinates) if keep is None else keep
     links = outward_pass(tree, motion, (q, qd, qdd))
-    found = _Passes(tree, links, asked, keep)
+    result = _Passes(tree, links, asked, keep)
     if tree.friction is not None:
         slope = tree.friction.slope(motion.qd)
         for row, k in enumerate(asked[asked < tree.num_rigid]):
-            found.matrix[:, row, 3 * found.places[k] + 1] += slope[:, k]
+            result.matrix[:, row, 3 * result.places[k] + 1] += slope[:, k]
     own = np.concatenate([np.arange(len(asked)), len(asked) + keep])
-    return Tangent(found.matrix.reshape(*found.matrix.shape[:2], len(own), 3), own, found.order)
+    return Tangent(result.matrix.reshape(*result.matrix.shape[:2], len(own), 3), own, result.order)
 
 
 def _columns(

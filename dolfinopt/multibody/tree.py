@@ -176,7 +176,7 @@ class Mechanism:
     @property
     def foreseen(self) -> Mechanism:
         """The same under the forces alone that are known in advance."""
-        return replace(self, forces=tuple(one for one in self.forces if one.known))
+        return replace(self, forces=tuple(force for force in self.forces if force.known))
 
     # -- coordinates -------------------------------------------------------------------------
 
@@ -240,8 +240,8 @@ class Mechanism:
     @cached_property
     def movable(self) -> tuple[int, ...]:
         """The bodies whose joints have a coordinate, in the order of these."""
-        found = [(j.coordinate, i) for i, j in enumerate(self.joints) if j.coordinate is not None]
-        return tuple(i for _, i in sorted(found))
+        result = [(j.coordinate, i) for i, j in enumerate(self.joints) if j.coordinate is not None]
+        return tuple(i for _, i in sorted(result))
 
     @property
     def cart_coordinate(self) -> int | None:
@@ -259,7 +259,7 @@ class Mechanism:
     def sites(self) -> tuple[tuple[int, ...], ...]:
         """Of every body the interfaces on which something sits, ascending."""
         taken = {(joint.parent, joint.interface) for joint in self.joints}
-        taken |= {*self.loads, *(one.site for one in self.forces)}
+        taken |= {*self.loads, *(force.site for force in self.forces)}
         every = range(len(self.joints))
         return tuple(tuple(sorted(s for body, s in taken if body == k)) for k in every)
 
@@ -268,7 +268,7 @@ class Mechanism:
         """The bodies that hang on every interface on which something sits, and on the ground."""
         sites = [(GROUND, 0), *((i, s) for i, own in enumerate(self.sites) for s in own)]
         places = [(joint.parent, joint.interface) for joint in self.joints]
-        return {site: tuple(k for k, one in enumerate(places) if one == site) for site in sites}
+        return {site: tuple(k for k, place in enumerate(places) if place == site) for site in sites}
 
     @cached_property
     def order(self) -> tuple[int, ...]:
@@ -289,10 +289,10 @@ class Mechanism:
 
     def way_to(self, site: Site) -> tuple[Site, ...]:
         """Return every body from the ground to a site, and the interface that leads on."""
-        found = [site]
-        while (joint := self.joints[found[0][0]]).parent != GROUND:
-            found.insert(0, (joint.parent, joint.interface))
-        return tuple(found)
+        result = [site]
+        while (joint := self.joints[result[0][0]]).parent != GROUND:
+            result.insert(0, (joint.parent, joint.interface))
+        return tuple(result)
 
     @cached_property
     def reach(self) -> float:
@@ -331,7 +331,9 @@ class Mechanism:
         return max(
             (
                 self.dim.softness(B, body.K, point)
-                for body, points in zip(self.bodies, (one.points for one in self.constants))
+                for body, points in zip(
+                    self.bodies, (constant.points for constant in self.constants)
+                )
                 if body.num_modes
                 for B, point in zip(np.split(body.outboard, len(points)), points, strict=True)
             ),
@@ -341,8 +343,10 @@ class Mechanism:
     @property
     def levers(self) -> np.ndarray:
         """Deflection of the end by unit rigid coordinates (R,), m; at most."""
-        reach = sum(float(np.linalg.norm(one.points, axis=1).max()) for one in self.constants)
-        reach += sum(float(np.linalg.norm(one.origin)) for one in self.joints)
+        reach = sum(
+            float(np.linalg.norm(constant.points, axis=1).max()) for constant in self.constants
+        )
+        reach += sum(float(np.linalg.norm(joint.origin)) for joint in self.joints)
         slides = [self.joints[i].kind == "prismatic" for i in self.movable]
         slides = [True, *slides] if self.cart is not None else slides
         return np.where(slides + [True] * self.rods, 1.0, reach)
@@ -363,7 +367,7 @@ class Mechanism:
         Those (arms,) of its outboard interfaces in its own frame along q (n, N), with the way by
         which bending shortens a stiffened arm, -1/2 q' K0 q.
         """
-        d, b, found = self.dim.d, self.dim.b, np.zeros((2, self.num_arms))
+        d, b, result = self.dim.d, self.dim.b, np.zeros((2, self.num_arms))
         for k, (part, body) in enumerate(zip(self.slices, self.arms)):
             moved = q[:, part] @ body.outboard.T
             if body.is_stiffened:
@@ -372,8 +376,8 @@ class Mechanism:
             parts = np.split(moved, [d], axis=1)
             sizes = [np.linalg.norm(x, axis=1).max(initial=0.0) for x in parts]
             length = np.linalg.norm(self.constants[k].points, axis=1).max()
-            found[:, k] = sizes[0] / (length or np.inf), sizes[1]
-        return found[0], found[1]
+            result[:, k] = sizes[0] / (length or np.inf), sizes[1]
+        return result[0], result[1]
 
     def stiffness(self) -> np.ndarray:
         """Return the block-diagonal stiffness (N, N)."""
@@ -449,5 +453,5 @@ def moves(bearing: ShapeIntegrals) -> list[tuple[str, str]]:
     """Return name and unit of a bearing's coordinates: x, y, z in m, rx, ry, rz in rad."""
     names = ("x", "y", "z", "rx", "ry", "rz")
     every = names if len(bearing.outboard) == len(names) else [names[i] for i in IN_PLANE]
-    found = [every[i] for i in bearing.outboard.argmax(axis=0)]
-    return [(name, "rad" if name.startswith("r") else "m") for name in found]
+    result = [every[i] for i in bearing.outboard.argmax(axis=0)]
+    return [(name, "rad" if name.startswith("r") else "m") for name in result]

@@ -94,12 +94,12 @@ def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation
     # The same on all ranks.
     arms, trajectory = evaluator.arms, evaluator.trajectory
     with together(evaluator.partition.world):
-        found = {k: arms[k].contacts(x > 0.5) for k, x in x_phys.items()}
-    whole = all(one.joins for one in found.values())
+        result = {k: arms[k].contacts(x > 0.5) for k, x in x_phys.items()}
+    whole = all(item.joins for item in result.values())
     if not evaluator.partition.world.allreduce(whole, MPI.MIN):
         return None
-    cut = {k: np.where(one.kept, 1.0, 0.0) for k, one in found.items()}
-    steps = sum(len(one.a) for one in trajectory.solutions) if trajectory else np.inf
+    cut = {k: np.where(item.kept, 1.0, 0.0) for k, item in result.items()}
+    steps = sum(len(solution.a) for solution in trajectory.solutions) if trajectory else np.inf
     with suppress(ConvergenceError), counted(NEWTON_ITERATIONS * steps):
         return evaluator.evaluate_densities(cut, simulated=True)
     return None
@@ -119,11 +119,11 @@ def evaluated_beside(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> 
         arm.coordinates = one.arms[k].coordinates
         if (known := one.arms[k].stiffening) is not None:
             arm.set_stiffening(known)
-    counts, found = replace(one.profile.counts), None
+    counts, result = replace(one.profile.counts), None
     with suppress(ConvergenceError):
-        found = evaluate(scene, one.partition, arms, x_phys, one.profile, simulated=False)[0]
+        result = evaluate(scene, one.partition, arms, x_phys, one.profile, simulated=False)[0]
     one.profile.counts = counts
-    return found
+    return result
 
 
 def solid_limits(evaluator: Evaluator) -> tuple[Limit, ...]:
@@ -132,11 +132,11 @@ def solid_limits(evaluator: Evaluator) -> tuple[Limit, ...]:
     None where there are no others, or where their motion cannot be simulated.
     """
     scene = evaluator.scene
-    if all(one.response.declared.of_nominal for one in constraints_of(scene)):
+    if all(item.response.declared.of_nominal for item in constraints_of(scene)):
         return ()
     solid = uniform_design(scene, evaluator.partition, evaluator.arms, 1.0)
-    found = evaluated_beside(evaluator, solid)
-    return () if found is None else tuple(o for o in limits_of(scene, found) if not o.of_mass)
+    result = evaluated_beside(evaluator, solid)
+    return () if result is None else tuple(o for o in limits_of(scene, result) if not o.of_mass)
 
 
 def solid_sentence(limits: Sequence[Limit]) -> str:
@@ -145,9 +145,9 @@ def solid_sentence(limits: Sequence[Limit]) -> str:
     Only loads that no mass adds to tell that: under inertia lighter arms may keep the limit.
     """
     parts = []
-    for one in limits:
-        never = not one.met and limited_by(one.quantity).needs == STATICS
-        parts.append(one.usage + " (cannot be kept)" * never)
+    for limit in limits:
+        never = not limit.met and limited_by(limit.quantity).needs == STATICS
+        parts.append(limit.usage + " (cannot be kept)" * never)
     return f"solid arms: {', '.join(parts)}"
 
 

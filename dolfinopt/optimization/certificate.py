@@ -144,9 +144,9 @@ def certify(
     variables = evaluator.variables
 
     def judged() -> Certificate:
-        found = judge(x, variables.xmin, variables.xmax, exact, frozen)
-        stationary = bool(found.kkt <= scene.optimizer.kkt_tolerance)
-        return replace(found, seconds=time.perf_counter() - begun, stationary=stationary)
+        result = judge(x, variables.xmin, variables.xmax, exact, frozen)
+        stationary = bool(result.kkt <= scene.optimizer.kkt_tolerance)
+        return replace(result, seconds=time.perf_counter() - begun, stationary=stationary)
 
     certificate: Certificate = on_root(evaluator.partition.world, judged)
     return certificate

@@ -62,8 +62,10 @@ class Evaluator:
         with together(self.partition.world):
             designs = {k: arm.physical_designs(parts[k], beta) for k, arm in arms.items()}
         count = 3 if self.scene.design.projection == "robust" else 1
-        variants = [{k: one[variant] for k, one in designs.items()} for variant in range(count)]
-        return [self._spread(one) for one in variants]
+        variants = [
+            {k: design[variant] for k, design in designs.items()} for variant in range(count)
+        ]
+        return [self._spread(item) for item in variants]
 
     def _spread(self, designs: dict[int, PhysicalDesign]) -> dict[int, PhysicalDesign]:
         """Add the arms that repeat another's design, with its densities (collective)."""
@@ -89,11 +91,12 @@ class Evaluator:
         """
         self.start = self.solutions, {k: arm.initial_vectors for k, arm in self.arms.items()}
         *others, nominal = self.physical_designs(x)
-        found = [
-            self.differentiated(one, self.evaluate_densities(densities(one))) for one in others
+        result = [
+            self.differentiated(other, self.evaluate_densities(densities(other)))
+            for other in others
         ]
         evaluation = self.evaluate_densities(densities(nominal))
-        return [*found, EvaluatedDesign(nominal, evaluation)]
+        return [*result, EvaluatedDesign(nominal, evaluation)]
 
     def accepted(self, designs: list[EvaluatedDesign]) -> list[EvaluatedDesign]:
         """Add the gradients to designs that were `tried` last (collective)."""
@@ -170,19 +173,19 @@ class Evaluator:
         low, high = self.variables.law_bounds
         if self.scene.objective.gradient == "esl":  # frozen loads say nothing of the law: it stays
             high = low
-        by_law = [(high - low) * one.get(LAW, 0.0) for one in by_cells]
+        by_law = [(high - low) * cell.get(LAW, 0.0) for cell in by_cells]
         by_cells = [
-            self.patterns.collect({k: x for k, x in one.items() if k != LAW}) for one in by_cells
+            self.patterns.collect({k: x for k, x in cell.items() if k != LAW}) for cell in by_cells
         ]
         backward = {LAW: np.array(by_law).T}
         with together(self.partition.world):
             for k, arm in self.variables.arms.items():
                 none = np.zeros(arm.mesh.num_cells)
-                by = [arm.backward(one[k], design[k]) if k in one else none for one in by_cells]
+                by = [arm.backward(cell[k], design[k]) if k in cell else none for cell in by_cells]
                 backward[k] = np.stack(by, axis=1)
         return np.ascontiguousarray(self.variables.join(backward).T)
 
 
 def densities(design: Mapping[int, PhysicalDesign]) -> dict[int, np.ndarray]:
     """Return the physical densities of every arm."""
-    return {k: one.x_phys for k, one in design.items()}
+    return {k: item.x_phys for k, item in design.items()}

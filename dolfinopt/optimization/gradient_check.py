@@ -115,13 +115,19 @@ def taylor_test(
 
 def held_steps(motion: Trajectory | None) -> tuple[Solution, ...]:
     """Return what motions begin with that are to have the time steps of this one."""
-    return () if motion is None else tuple(replace(one, held=True) for one in motion.solutions)
+    return (
+        ()
+        if motion is None
+        else tuple(replace(solution, held=True) for solution in motion.solutions)
+    )
 
 
 def check_exact(scene: Scene) -> None:
     """Raise InputError, of one line, where the objective has no exact gradient to test."""
     if missing := without_exact_gradient(scene):
-        known = " | ".join(f'"{name}"' for name, one in METHODS.items() if one.adjoint is not None)
+        known = " | ".join(
+            f'"{name}"' for name, item in METHODS.items() if item.adjoint is not None
+        )
         raise InputError(
             f"{scene.source}: {missing}: --check tests the exact gradient; expected {known}"
         )
@@ -149,9 +155,9 @@ def _fixed_objective(chain: Evaluator) -> Callable[[np.ndarray], float]:
 def _at(base: Trajectory, trajectory: Trajectory, part: MotionResponse) -> float:
     """Return one value of a motion, or of its scenarios, at the instants that `base` chooses."""
     values = []
-    for one, own in zip(motions_of(trajectory), motions_of(base), strict=True):
+    for item, own in zip(motions_of(trajectory), motions_of(base), strict=True):
         seen = part.seen(own)
-        values.append(part.value_at(one.at(seen.t), part.load_cases(seen)))
+        values.append(part.value_at(item.at(seen.t), part.load_cases(seen)))
     return part.combine(trajectory.scene, values)[0]
 
 
@@ -161,7 +167,7 @@ def _directions(arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
 
     def noise(k: int) -> np.ndarray:
         x, y, *z = arms[k].mesh.centroid.T * 1e3
-        angle = 12.9898 * x + 78.233 * y + sum(37.719 * one for one in z)
+        angle = 12.9898 * x + 78.233 * y + sum(37.719 * item for item in z)
         return 2.0 * np.modf(np.abs(np.sin(angle + k) * 43758.5453))[0] - 1.0
 
     def smooth(k: int) -> np.ndarray:

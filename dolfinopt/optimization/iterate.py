@@ -191,7 +191,7 @@ class Iterate:
         """Evaluate a step (collective); None where it leads nowhere, which is taken back."""
         self.stuck = ""
         self.change = float(np.abs(new - self.x).max())
-        steps = sum(len(one.a) for one in self.evaluator.solutions)  # none off the root
+        steps = sum(len(solution.a) for solution in self.evaluator.solutions)  # none off the root
         most = NEWTON_ITERATIONS * steps * len(self.designs)
         try:
             with counted(most if steps else np.inf):
@@ -212,8 +212,8 @@ class Iterate:
         if self.curved:
             step = partial(step, widest=CURVED_ASYMPTOTE_DISTANCE)
         with self.evaluator.profile.phase("mma"):
-            found: tuple[np.ndarray, MMAState] = on_root(self.world, step, *self._posed)
-        return found
+            result: tuple[np.ndarray, MMAState] = on_root(self.world, step, *self._posed)
+        return result
 
     @property
     def _posed(self) -> tuple[np.ndarray, ...]:
@@ -241,7 +241,7 @@ class Iterate:
             change=self.change,
             seconds=0.0,
             kkt=self.residual.rms,
-            constraints={one.name: one.value for one in self.problem.limits},
+            constraints={limit.name: limit.value for limit in self.problem.limits},
             tightest=tightest(self.problem.limits),
         )
 
@@ -257,8 +257,8 @@ class Iterate:
 
     def _residual(self) -> Residual:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
-        found: Residual = on_root(self.world, kkt_residual, *self._posed)
-        return found
+        result: Residual = on_root(self.world, kkt_residual, *self._posed)
+        return result
 
     # -- memory ------------------------------------------------------------------------------
 

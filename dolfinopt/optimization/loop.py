@@ -180,9 +180,11 @@ class _Run:
 
     def _finished(self) -> bool:
         """Decide whether to stop; the same on all ranks."""
-        one = self.iterate
-        self.finished = stop_code(self.scene, one.iteration, one.progress, one.best, one.stuck)
-        late = self._begins_with_frozen_loads and one.progress.gain(WINDOW // 2) <= FROZEN_GAIN
+        iterate = self.iterate
+        self.finished = stop_code(
+            self.scene, iterate.iteration, iterate.progress, iterate.best, iterate.stuck
+        )
+        late = self._begins_with_frozen_loads and iterate.progress.gain(WINDOW // 2) <= FROZEN_GAIN
         return late or self.finished is not None
 
     @property
@@ -199,11 +201,11 @@ class _Run:
         """Go over to the exact gradient where frozen loads have done their work (collective)."""
         # Frozen loads lead past resonances of the initial design, which the exact gradient, true
         # as it is, does not see beyond.
-        one, most = self.iterate, self.scene.optimizer.max_iterations
-        if not self._begins_with_frozen_loads or one.iteration >= most:
+        iterate, most = self.iterate, self.scene.optimizer.max_iterations
+        if not self._begins_with_frozen_loads or iterate.iteration >= most:
             return False
-        one.use_gradient("exact")
-        one.stuck, self.exact_from, self.finished = "", one.iteration, None
+        iterate.use_gradient("exact")
+        iterate.stuck, self.exact_from, self.finished = "", iterate.iteration, None
         return True
 
     def _stiffens(self) -> bool:
@@ -229,40 +231,40 @@ class _Run:
 
     def _result(self) -> RankResult:
         """Assess the best design (collective)."""
-        one, counts, code = self.iterate, replace(self.profile.counts), self.finished
+        iterate, counts, code = self.iterate, replace(self.profile.counts), self.finished
         assert code is not None
-        if one.return_to_best():
-            one.measure()
-        certificate = certify(self.evaluator, one.x, one.nominal, one.problem)
-        x_phys = one.nominal.x_phys
-        final = assess(self.evaluator, x_phys, one.nominal.evaluation, self.selection)
+        if iterate.return_to_best():
+            iterate.measure()
+        certificate = certify(self.evaluator, iterate.x, iterate.nominal, iterate.problem)
+        x_phys = iterate.nominal.x_phys
+        final = assess(self.evaluator, x_phys, iterate.nominal.evaluation, self.selection)
         if final.initial is not None:
             self.initial_deviation = final.initial.deviation
         if self.evaluator.scene.horizon != self.scene.horizon:
             self.initial_deviation = np.empty((0, 2))  # of another time
-        kept = one.problem.excess == 0.0
-        best = one.best.iteration
-        returned = "" if best in (-1, one.iteration) else f"returned: iteration {best}"
+        kept = iterate.problem.excess == 0.0
+        best = iterate.best.iteration
+        returned = "" if best in (-1, iterate.iteration) else f"returned: iteration {best}"
         return RankResult(
             scene=self.evaluator.scene,
             partition=self.partition,
             arms=self.arms,
             x_phys=x_phys,
-            x_filtered=self.evaluator.smoothed(one.x) if self.scene.design.projection else None,
+            x_filtered=self.evaluator.smoothed(iterate.x) if self.scene.design.projection else None,
             evaluation=final.evaluation,
             crisp=final.crisp,
             trajectory=self.evaluator.trajectory,
             initial_deviation=self.initial_deviation,
             rows=self.history,
-            iterations=one.iteration,
-            best_iteration=best if best >= 0 else one.iteration,
+            iterations=iterate.iteration,
+            best_iteration=best if best >= 0 else iterate.iteration,
             stop_code=code,
-            ending=ending(self.scene, code, one.progress, kept, one.stuck, returned),
-            kkt=one.residual.rms,
+            ending=ending(self.scene, code, iterate.progress, kept, iterate.stuck, returned),
+            kkt=iterate.residual.rms,
             exact_from=self.exact_from,
             certificate=certificate,
-            limits=one.problem.limits,
-            conflicts=conflicts(code, one.problem.limits, self.solid),
+            limits=iterate.problem.limits,
+            conflicts=conflicts(code, iterate.problem.limits, self.solid),
             profile=self.profile,
             counts=counts,
             choice=final.selection,

@@ -117,7 +117,7 @@ def mma_step(
     Source: doi:10.1002/nme.1620240207 and Svanberg's notes of 2007.
     """
     x, f = np.array(x, dtype=np.float64), np.asarray(f, dtype=np.float64)
-    low, high = (np.broadcast_to(np.asarray(one, np.float64), x.shape) for one in (xmin, xmax))
+    low, high = (np.broadcast_to(np.asarray(item, np.float64), x.shape) for item in (xmin, xmax))
     with np.errstate(over="ignore", invalid="ignore"):  # found by `_check`
         gradients = np.vstack((df0dx, dfdx)) * (high - low)
     _check(x, low, high, f, gradients)

@@ -40,13 +40,13 @@ class EvaluatedDesign:
     def of_nominal(self) -> np.ndarray:
         """True (k,) for constraints that the nominal one of robust designs carries alone."""
         limited = self.evaluation.responses[1:]
-        own = [find(one.response).declared.of_nominal for one in limited for _ in one.values]
+        own = [find(item.response).declared.of_nominal for item in limited for _ in item.values]
         return np.array(own, dtype=bool)
 
     @property
     def x_phys(self) -> dict[int, np.ndarray]:
         """Physical densities of this rank's arms."""
-        return {k: one.x_phys for k, one in self.physical.items()}
+        return {k: item.x_phys for k, item in self.physical.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,16 +78,16 @@ class Problem:
     @property
     def excess(self) -> float:
         """Largest relative violation of a limit by its true value; 0 where all are met."""
-        return max((0.0 if one.met else one.excess for one in self.limits), default=0.0)
+        return max((0.0 if limit.met else limit.excess for limit in self.limits), default=0.0)
 
     def by_limit(self, of_rows: np.ndarray) -> dict[str, float]:
         """Return sums of (m,) numbers of the rows by the names of the limits that they share."""
         sums = np.bincount(self.rows, of_rows, minlength=len(self.limits))
-        return {one.name: float(x) for one, x in zip(self.limits, sums, strict=True)}
+        return {limit.name: float(x) for limit, x in zip(self.limits, sums, strict=True)}
 
     def merit(self, size: float) -> float:
         """Return f0 / size + 10 sum of excesses, of the limits' true values."""
-        over = sum(one.excess for one in self.limits if not one.met)
+        over = sum(limit.excess for limit in self.limits if not limit.met)
         return float(self.values[0] / size + LIMIT_PRICE * over)
 
 
@@ -99,13 +99,13 @@ def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndar
     one does, up to `ERODED_LIMIT_FACTOR`: its gradients keep members from getting thin, and it does
     not fall apart.
     """
-    found = [np.array(one.evaluation.smooth_limits) for one in designs]
+    result = [np.array(design.evaluation.smooth_limits) for design in designs]
     if len(designs) > 1 and scene.design.limits_on == "nominal":
         eroded, nominal = (1.0 + np.array(designs[i].evaluation.constraints) for i in (0, -1))
         known = (eroded > 0.0) & (nominal > 0.0)  # what nothing loads has no share
         ratio = np.divide(eroded, nominal, out=np.ones_like(eroded), where=known)
-        found[0] = found[0] * np.minimum(ratio, ERODED_LIMIT_FACTOR)
-    return tuple(found)
+        result[0] = result[0] * np.minimum(ratio, ERODED_LIMIT_FACTOR)
+    return tuple(result)
 
 
 def problem_of(
@@ -128,12 +128,12 @@ def problem_of(
     held = limits_at(scene, designs) if held is None else held
     nominal, robust = designs[-1], len(designs) > 1
     scales = [
-        np.array(one.evaluation.smooth_limits) / limits
-        for one, limits in zip(designs, held, strict=True)
+        np.array(design.evaluation.smooth_limits) / limits
+        for design, limits in zip(designs, held, strict=True)
     ]
     f = [
-        (1.0 + np.array(one.evaluation.constraints)) * scale - 1.0
-        for one, scale in zip(designs, scales, strict=True)
+        (1.0 + np.array(design.evaluation.constraints)) * scale - 1.0
+        for design, scale in zip(designs, scales, strict=True)
     ]
     own, binding = nominal.of_nominal, list(range(len(designs)))
     if robust and scene.design.limits_on == "nominal":
@@ -147,7 +147,7 @@ def problem_of(
         by_all = [designs[i].constraints[~own] * scales[i][~own, None] for i in binding]
         dfdx = np.vstack([by_nominal, *by_all])
     f0, df0dx = _objective(scene, designs)
-    variants = [limits_of(scene, one.evaluation) for one in designs]
+    variants = [limits_of(scene, design.evaluation) for design in designs]
     limits = variants[-1] if scene.design.limits_on == "nominal" else worst_limits(variants)
     rows = np.concatenate([np.flatnonzero(own), *[np.flatnonzero(~own)] * len(binding)])
     values = np.concatenate([f[-1][own], *(f[i][~own] for i in binding)])
@@ -164,9 +164,9 @@ def _objective(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[float,
             dilated = designs[1]
             by_x = value / dilated.evaluation.objective * dilated.objective
         return value, turned * by_x
-    values = [one.evaluation.objective for one in designs]
+    values = [design.evaluation.objective for design in designs]
     f0, weights = worst_of(values, scene.objective.exponent, response.turned)
     if not nominal.differentiated:
         return f0, np.empty(0)
-    parts = [w * one.objective for w, one in zip(weights, designs, strict=True)]
+    parts = [w * design.objective for w, design in zip(weights, designs, strict=True)]
     return f0, turned * np.sum(parts, axis=0)

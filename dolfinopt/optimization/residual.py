@@ -75,20 +75,20 @@ def kkt_residual(
     best, inside = Residual(np.inf, np.zeros(f.size)), roomy
     while True:
         count = max(1, np.count_nonzero(inside | roomy))
-        found = _multipliers(g0, g, inside, slack / np.sqrt(count))
-        L = g0 + found @ g
+        result = _multipliers(g0, g, inside, slack / np.sqrt(count))
+        L = g0 + result @ g
         t = TRIAL_STEP_SHARE / (np.abs(L).max() or 1.0)
         moving = free & (t * L <= down) & (t * L >= -up)
         step = np.where(moving, L, np.clip(t * L, -up, down) / t)
         movable = roomy | (step != 0.0)
         count = max(1, np.count_nonzero(movable))
-        own = float(step @ step + np.square(found * slack).sum() / count)
+        own = float(step @ step + np.square(result * slack).sum() / count)
         if own == 0.0:
-            return Residual(0.0, found, scale)
+            return Residual(0.0, result, scale)
         moved = np.where(movable, g0, 0.0)
         rms = float(np.sqrt(own / (moved @ moved))) if moved.any() else np.inf
         if rms < best.rms:
-            best, inside = Residual(rms, found, scale), moving
+            best, inside = Residual(rms, result, scale), moving
         else:
             return best
 

@@ -51,7 +51,11 @@ class HistoryRow:
     def columns(self) -> list[str]:
         """Names of `values`, the header of history.csv."""
         own = [f.name for f in fields(self)][:-3]
-        return own + list(self.constraints) + [f"{MULTIPLIER}{one}" for one in self.multipliers]
+        return (
+            own
+            + list(self.constraints)
+            + [f"{MULTIPLIER}{multiplier}" for multiplier in self.multipliers]
+        )
 
     @property
     def values(self) -> list[float]:

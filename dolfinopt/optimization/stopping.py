@@ -83,19 +83,19 @@ def conflicts(code: StopCode, limits: Sequence[Limit], solid: Sequence[Limit] = 
         limits: of the design.
         solid: of solid arms, as far as they were looked at.
     """
-    missed = {one.name for one in limits if not one.met}
+    missed = {limit.name for limit in limits if not limit.met}
     if not missed:
         return ""
     if code is StopCode.ITERATIONS:
-        beyond = [one.usage for one in solid if not one.met and one.name in missed]
+        beyond = [item.usage for item in solid if not item.met and item.name in missed]
         if beyond:
             return f"solid arms do not keep it either ({', '.join(beyond)}): relax it"
         return "let the optimisation go on (optimizer.max_iterations)"
     *rest, last = sorted(
-        one.bound
-        for one in limits
-        if one.excess >= -REACHED_LIMIT_SHARE
-        and not (one.quantity == "volume_fraction" and one.limit >= 1.0)
+        limit.bound
+        for limit in limits
+        if limit.excess >= -REACHED_LIMIT_SHARE
+        and not (limit.quantity == "volume_fraction" and limit.limit >= 1.0)
     )
     if rest:
         return f"{', '.join(rest)} and {last} conflict: relax one of them"

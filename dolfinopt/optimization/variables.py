@@ -65,7 +65,7 @@ class Variables:
 
         The law's, which all ranks have, may be missing where it has no variables.
         """
-        cells = {k: one for k, one in parts.items() if k != LAW}
+        cells = {k: part for k, part in parts.items() if k != LAW}
         every = self.partition.world.bcast(gather_cells(self.partition, cells), root=0)
         law = [parts[LAW]] if LAW in parts else []
         return np.concatenate([*every.values(), *law])

@@ -297,11 +297,11 @@ def balanced(arm: ElasticArm, options: Options, start: np.ndarray | None = None)
     upper = np.linalg.cholesky(arm.energy_matrix(V)).T
     _, triangle = np.linalg.qr((upper @ reduced.vectors @ factor).T)
     U, sigma, _ = on_root(arm.comm, partial(np.linalg.svd, triangle.T, full_matrices=False))
-    found = int((sigma > DEFLATION_SHARE * sigma[0]).sum())
-    if found < options.coordinates:
+    result = int((sigma > DEFLATION_SHARE * sigma[0]).sum())
+    if result < options.coordinates:
         raise ConvergenceError(
             f"arm {arm.mesh.name!r}: responses between {options.band[0]:g} and "
-            f"{options.band[1]:g} Hz have only {found} of {options.coordinates} directions; "
+            f"{options.band[1]:g} Hz have only {result} of {options.coordinates} directions; "
             "ask for fewer reduction.coordinates or widen reduction.frequencies"
         )
     return ritz(arm, combine(V, np.linalg.solve(upper, U[:, : options.coordinates])))

@@ -113,7 +113,7 @@ def stressed_modulus(state: DesignState) -> StressedModulus:
 def _ritz(state: DesignState, a: np.ndarray, known: Sequence[BucklingModes]) -> np.ndarray:
     """Return the largest mu (n,) that the known modes show of all instants."""
     arm, fields = state.elastic, state.load_fields
-    V = np.concatenate([one.field[:, :, :2] for one in known], axis=2)
+    V = np.concatenate([item.field[:, :, :2] for item in known], axis=2)
     every = Prestress(fields, stressed_modulus(state), np.eye(a.shape[1]))
     K, K0 = arm.energy_matrix(V), every.stiffness(V)
 
@@ -125,14 +125,14 @@ def _ritz(state: DesignState, a: np.ndarray, known: Sequence[BucklingModes]) -> 
         of_instants = np.tensordot(a, W.T @ K0 @ W, 1)
         return np.asarray(np.linalg.eigvalsh(-of_instants)[:, -1])
 
-    found: np.ndarray = on_root(arm.comm, largest)
-    return found
+    result: np.ndarray = on_root(arm.comm, largest)
+    return result
 
 
 def _of_design(state: DesignState, loads: Sequence[ArmLoads]) -> list[Pressed]:
     """Return the instants of all arms with a design (collective on its ranks)."""
     with state.elastic.profile.phase("buckling"):
-        return [each for one in loads for each in pressed(state, one)]
+        return [each for load in loads for each in pressed(state, load)]
 
 
 # -- as objective and as limit -------------------------------------------------------------------
@@ -153,12 +153,12 @@ class Buckling(Response):
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of the p-norm, which is always the exact one (collective)."""
-        found = self._found(analysis)
-        weights = self._values(analysis, found)[2]
+        result = self._found(analysis)
+        weights = self._values(analysis, result)[2]
         parts = {}
         with together(analysis.partition.world):
             for k, state in analysis.designs.items():
-                parts[k] = _gradient_of_arm(state, found[k], weights.get(k, []))
+                parts[k] = _gradient_of_arm(state, result[k], weights.get(k, []))
         return [through_motions(analysis, parts)]
 
     def smooth_of(self, values: np.ndarray) -> np.ndarray:
@@ -180,12 +180,12 @@ class Buckling(Response):
         self, analysis: Analysis, found: Mapping[int, list[Pressed]]
     ) -> tuple[float, float, dict[int, list[np.ndarray]]]:
         """Return the largest 1 / factor, the p-norm, and by design its derivatives (collective)."""
-        mine = {k: [one.modes.inverse for one in each] for k, each in found.items()}
+        mine = {k: [item.modes.inverse for item in each] for k, each in found.items()}
         every = on_all_ranks(analysis.partition, mine)
         flat = [each for arm in every.values() for each in arm]
         values = np.maximum(np.concatenate([*flat, [1.0 / LARGEST_FACTOR]]), 0.0)
         smooth, by = p_norm(values, self.options.exponent)
-        parts = iter(np.split(by, np.cumsum([len(one) for one in flat])))
+        parts = iter(np.split(by, np.cumsum([len(item) for item in flat])))
         weights = {k: [next(parts) for _ in arm] for k, arm in every.items()}
         return float(values.max()), smooth, weights
 
@@ -194,16 +194,16 @@ def _gradient_of_arm(
     state: DesignState, found: Sequence[Pressed], weights: Sequence[np.ndarray]
 ) -> ArmGradient:
     """Differentiate by what one design's K0 is made of (collective on the arm's ranks)."""
-    counted = [(one, by) for one, by in zip(found, weights, strict=True) if by.any()]
+    counted = [(item, by) for item, by in zip(found, weights, strict=True) if by.any()]
     if not counted:
         return ArmGradient([], None, (Products(),))
-    modes = np.concatenate([one.modes.field for one, _ in counted], axis=2)
-    mu = np.concatenate([one.modes.inverse for one, _ in counted])
+    modes = np.concatenate([item.modes.field for item, _ in counted], axis=2)
+    mu = np.concatenate([item.modes.inverse for item, _ in counted])
     by_mu = np.concatenate([by for _, by in counted])
     instant = np.repeat(np.arange(len(counted)), [len(by) for _, by in counted])
     by_K0 = np.zeros((len(counted), len(mu), len(mu)))
     by_K0[instant, range(len(mu)), range(len(mu))] = -by_mu
-    a, fields = np.array([one.a for one, _ in counted]), state.load_fields
+    a, fields = np.array([item.a for item, _ in counted]), state.load_fields
     one = Prestress(fields, stressed_modulus(state), a).gradient(modes, by_K0)
     pair = (modes * (-by_mu * mu), modes)
     by_loads = [

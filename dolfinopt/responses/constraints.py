@@ -112,11 +112,13 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
     """
     limits = []
     # The objective's values come first: it may be the response of a limit, too.
-    for bound, found in zip(constraints_of(scene), evaluation.responses[1:], strict=True):
+    for bound, result in zip(constraints_of(scene), evaluation.responses[1:], strict=True):
         unit_of, lower = bound.response.unit_of, bound.response.declared.lower
         limits += [
             Limit(bound.name, arm, float(value), float(limit), unit_of(arm), lower)
-            for arm, value, limit in zip(found.arms, found.values, bound.limits(found), strict=True)
+            for arm, value, limit in zip(
+                result.arms, result.values, bound.limits(result), strict=True
+            )
         ]
     return tuple(limits)
 
@@ -128,7 +130,7 @@ def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
     """
     worst = []
     for limit, *others in zip(*reversed(variants), strict=True):
-        values = [limit.value, *(one.value for one in others)]
+        values = [limit.value, *(other.value for other in others)]
         extreme = min(values) if limit.least else max(values)
         kept = limit.value if limited_by(limit.quantity).of_nominal else extreme
         worst.append(replace(limit, value=kept))
@@ -137,7 +139,7 @@ def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
 
 def violated(limits: Sequence[Limit]) -> str:
     """Return the sentences of all constraints that are not met, in one line; "" if all are."""
-    return "; ".join(one.sentence for one in limits if not one.met)
+    return "; ".join(limit.sentence for limit in limits if not limit.met)
 
 
 def tightest(limits: Sequence[Limit]) -> str:
@@ -145,10 +147,10 @@ def tightest(limits: Sequence[Limit]) -> str:
 
     E.g. "limits met" or "settling 12 % over limit".
     """
-    asked = [one for one in limits if one.quantity != "volume_fraction"]
+    asked = [limit for limit in limits if limit.quantity != "volume_fraction"]
     if not asked:
         return ""
-    worst = max(asked, key=lambda one: one.excess)
+    worst = max(asked, key=lambda item: item.excess)
     if worst.met:
         return "limits met"
     percent = 100.0 * worst.excess
@@ -158,4 +160,4 @@ def tightest(limits: Sequence[Limit]) -> str:
 
 def summary_of(limits: Sequence[Limit]) -> Mapping[str, Any]:
     """Return the constraints by name, for summary.json."""
-    return {one.name: one.to_dict() for one in limits}
+    return {limit.name: limit.to_dict() for limit in limits}

@@ -80,7 +80,9 @@ class Evaluation(Motion):
 
     def values_of(self, name: str) -> tuple[float, ...]:
         """Return the true values of a response, by its name; none where it was not asked for."""
-        return next((one.values for one in self.responses if one.response == name), ())
+        return next(
+            (response.values for response in self.responses if response.response == name), ()
+        )
 
 
 def evaluate(
@@ -148,11 +150,11 @@ def _measured(analysis: Analysis, motion: Motion) -> Evaluation:
     measured = [objective_of(analysis.scene).measure(analysis)]
     constraints, smooth_limits = list[float](), list[float]()
     for bound in constraints_of(analysis.scene):
-        found = bound.response.measure(analysis)
-        limits = bound.smooth_limits(found)
-        constraints += map(float, np.array(found.smooth) / limits - 1.0)
+        result = bound.response.measure(analysis)
+        limits = bound.smooth_limits(result)
+        constraints += map(float, np.array(result.smooth) / limits - 1.0)
         smooth_limits += map(float, limits)
-        measured.append(found)
+        measured.append(result)
     return Evaluation(
         **vars(replace(motion, objective=measured[0].total)),
         constraints=tuple(constraints),
@@ -227,16 +229,16 @@ def constraint_gradients(
         by: as for `gradient`.
     """
     analysis = analysis_of(scene, partition, arms, trajectory, profile or Profile(), by)
-    found = []
+    result = []
     for k, bound in enumerate(constraints_of(scene), 1):
         rows = bound.response.gradients(analysis)
         values = measured[k] if measured else bound.response.measure(analysis)
         limits = bound.smooth_limits(values)
-        found += [
+        result += [
             ConstraintGradient(bound.response, row, float(limit))
             for row, limit in zip(rows, limits, strict=True)
         ]
-    return found
+    return result
 
 
 # -- the motion ------------------------------------------------------------------------------
@@ -267,13 +269,13 @@ def simulated_together(
 
     def run() -> None:
         first = simulate(scene, chain_of(scene, owned), profile, starts[0] if starts else None)
-        found = []
-        for number, one in enumerate(others, 1):
+        result = []
+        for number, other in enumerate(others, 1):
             start = starts[number] if number < len(starts) else first.solution
             # The nominal machine's feed-forward is kept where the motion is the same.
-            held = first.feed_forward if one.motion == scene.motion else None
-            found.append(simulate(one, bodies_in(scene, one, owned), profile, start, held))
-        kept.append(replace(first, scenarios=tuple(found)))
+            held = first.feed_forward if other.motion == scene.motion else None
+            result.append(simulate(other, bodies_in(scene, other, owned), profile, start, held))
+        kept.append(replace(first, scenarios=tuple(result)))
 
     on_root(partition.world, run)
     return kept[0] if kept else None
@@ -290,7 +292,7 @@ def _figures(trajectory: Trajectory) -> Motion:
     worst = worst_instants(trajectory, scene.objective.load_cases)
     distance, when = trajectory.max_deviation
     return Motion(
-        objective=sum(one.of_motion(trajectory) for _, one in parts) if parts else np.nan,
+        objective=sum(item.of_motion(trajectory) for _, item in parts) if parts else np.nan,
         compliance=float(trajectory.compliance[worst].sum()),
         max_deviation=distance,
         max_deviation_time=when,
@@ -319,9 +321,9 @@ def decide_stiffening(
     """
     if partition.world.allreduce(all(arm.stiffening is not None for arm in arms.values()), min):
         return
-    found = _stiffening(scenes, partition, arms)
+    result = _stiffening(scenes, partition, arms)
     for arm in arms.values():
-        arm.set_stiffening(found)
+        arm.set_stiffening(result)
 
 
 def reconsider_stiffening(
@@ -337,10 +339,10 @@ def reconsider_stiffening(
     known = partition.world.bcast(stiffening_of(arms), root=0)
     if scenes[0].simulation.stiffening != "auto" or known is None or known.on:
         return False
-    found = _stiffening(scenes, partition, arms)
+    result = _stiffening(scenes, partition, arms)
     for arm in arms.values():
-        arm.set_stiffening(found)
-    return found.on
+        arm.set_stiffening(result)
+    return result.on
 
 
 def _stiffening(
@@ -354,9 +356,9 @@ def _stiffening(
         mine = {k: arm.current.static_body for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
 
-    def largest(one: Scene) -> float:
-        t = np.linspace(0.0, one.motion.horizon, COARSE_INSTANTS + 1)
-        return largest_stiffness_change(one, bodies_in(scenes[0], one, owned), t)
+    def largest(scene: Scene) -> float:
+        t = np.linspace(0.0, scene.motion.horizon, COARSE_INSTANTS + 1)
+        return largest_stiffness_change(scene, bodies_in(scenes[0], scene, owned), t)
 
     change: float = on_root(partition.world, lambda: max(map(largest, scenes)))
     return Stiffening(change, change > STIFFNESS_CHANGE if stated == "auto" else stated)

@@ -54,12 +54,12 @@ class Eigenfrequency(Response):
         chain = _frozen(analysis)
         with together(partition.world):
             mine = {
-                place: (self.squared_period(one)[0], one.frequency)
-                for place, one in _modes(_by_place(scene, designs), chain).items()
+                place: (self.squared_period(mode)[0], mode.frequency)
+                for place, mode in _modes(_by_place(scene, designs), chain).items()
             }
-        found = on_all_ranks(partition, mine)
-        periods, frequencies = zip(*found.values(), strict=True)
-        names = tuple(scene.arms[place].name for place in found)
+        result = on_all_ranks(partition, mine)
+        periods, frequencies = zip(*result.values(), strict=True)
+        names = tuple(scene.arms[place].name for place in result)
         return Measured(self.name, names, frequencies, periods)
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
@@ -73,10 +73,10 @@ class Eigenfrequency(Response):
             by_place = _by_place(scene, designs)
             modes = _modes(by_place, chain)
             own = {}
-            for place, one in modes.items():
-                _, by_values = self.squared_period(one)
-                own[place] = period_gradient(by_place[place], one, by_values, analysis.by)
-        by_carried = on_all_ranks(partition, {place: one[1] for place, one in own.items()})
+            for place, mode in modes.items():
+                _, by_values = self.squared_period(mode)
+                own[place] = period_gradient(by_place[place], mode, by_values, analysis.by)
+        by_carried = on_all_ranks(partition, {place: item[1] for place, item in own.items()})
         rows = []
         zero = list(map(np.zeros_like, chain.carried()))
         with together(partition.world):
@@ -84,10 +84,10 @@ class Eigenfrequency(Response):
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]
                 by_body = by_owner(scene, chain.cotangents(carried))
                 row = {
-                    k: rigid_gradient(one, by_body[k], analysis.by)
+                    k: rigid_gradient(design, by_body[k], analysis.by)
                     if _counts(by_body[k])
-                    else analysis.by(one, Products())  # it is not outboard of this place
-                    for k, one in designs.items()
+                    else analysis.by(design, Products())  # it is not outboard of this place
+                    for k, design in designs.items()
                 }
                 owner = scene.owners[place]
                 if owner in row:
@@ -136,4 +136,4 @@ def _by_place(scene: Scene, designs: Mapping[int, DesignState]) -> dict[int, Des
 def _modes(designs: Mapping[int, DesignState], chain: FrozenTree) -> dict[int, LoadedModes]:
     """Return the loaded modes of arms by their place in the chain; within `together`."""
     carried = chain.carried()
-    return {place: one.loaded_modes(place, carried[place]) for place, one in designs.items()}
+    return {place: design.loaded_modes(place, carried[place]) for place, design in designs.items()}

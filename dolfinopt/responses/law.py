@@ -59,12 +59,12 @@ class PathRate(Response):
         smooth, by_rates = p_norm(np.abs(rates), self.options.exponent)
         scale = path_length(motion) / motion.duration**self.order
         waves = [
-            rates_of(ShapedLaw(NO_LAW, tuple(one)), self.order)
-            for one in np.eye(len(motion.coefficients))
+            rates_of(ShapedLaw(NO_LAW, tuple(item)), self.order)
+            for item in np.eye(len(motion.coefficients))
         ]
-        found = [float(by_rates @ (np.sign(rates) * scale * wave)) for wave in waves]
-        found.append(-self.order / motion.duration * smooth)
-        return [{LAW: np.array(found[: len(law_names(scene))])}]
+        result = [float(by_rates @ (np.sign(rates) * scale * wave)) for wave in waves]
+        result.append(-self.order / motion.duration * smooth)
+        return [{LAW: np.array(result[: len(law_names(scene))])}]
 
     def _rates(self, scene: Scene) -> np.ndarray:
         """Return them at even shares of the duration (n,)."""

@@ -60,18 +60,18 @@ def linearised_machine(
     @cache
     def machine(method: str, count: int) -> StateSpace:
         owned = reductions.bodies(reductions.reduced(method, count))
-        found: StateSpace = on_root(
+        result: StateSpace = on_root(
             partition.world,
             lambda: state_space(simulate(scene, chain_of(scene, owned), profile), t),
         )
-        return found
+        return result
 
     @cache
     def judged(count: int) -> StateSpace:
-        found = machine(scene.reduction.method, count)
+        result = machine(scene.reduction.method, count)
         exact = machine(RICHER_METHOD, min(2 * count, reductions.limit))
-        held = accurate_below(found.poles, exact.poles, 1.0 / scene.motion.horizon)
-        return replace(found, accurate_below=held)
+        held = accurate_below(result.poles, exact.poles, 1.0 / scene.motion.horizon)
+        return replace(result, accurate_below=held)
 
     own = max((arm.coordinates or 0 for arm in arms.values()), default=0)
     count: int = partition.world.allreduce(own, max)

@@ -155,8 +155,8 @@ class MotionResponse(Response):
             same = np.array_equal(own.indices, cases.indices)
             return self.value_at(there, own if same else cases)
 
-        found = trajectory.followed(seen.t[cases.indices], by.unknowns, by.motion, value)
-        return replace(found, bodies=list(map(add_integrals, found.bodies, by.bodies)))
+        result = trajectory.followed(seen.t[cases.indices], by.unknowns, by.motion, value)
+        return replace(result, bodies=list(map(add_integrals, result.bodies, by.bodies)))
 
     def load_case_moments(self, trajectory: Trajectory) -> list[np.ndarray]:
         """Return A = sum_j lambda_j q_j' (q, q) of every arm, for a gradient with frozen loads.
@@ -187,8 +187,8 @@ class MotionResponse(Response):
     def of_trajectory(self, trajectory: Trajectory) -> tuple[float, float]:
         """Return true and smooth value of a motion, or of its scenarios together (root only)."""
         scene, motions = trajectory.scene, motions_of(trajectory)
-        smooth = self.combine(scene, [self.of_motion(one) for one in motions])[0]
-        true = [self.extreme(one) for one in motions]
+        smooth = self.combine(scene, [self.of_motion(motion) for motion in motions])[0]
+        true = [self.extreme(motion) for motion in motions]
         if not self.limited and scene.objective.scenarios == "sum":
             return combined(scene, true)[0], smooth
         lower = self.turned
@@ -203,14 +203,14 @@ class MotionResponse(Response):
         parts = self.parts(analysis.scene)
 
         def values() -> list[tuple[float, float]]:
-            return [one.of_trajectory(analysis.motion) for _, one in parts]
+            return [item.of_trajectory(analysis.motion) for _, item in parts]
 
         true, smooth = zip(*on_root(analysis.partition.world, values), strict=True)
         return Measured(self.name, tuple(name for name, _ in parts), true, smooth)
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of every value by the physical densities (collective)."""
-        return [one._of_part(analysis) for _, one in self.parts(analysis.scene)]
+        return [item._of_part(analysis) for _, item in self.parts(analysis.scene)]
 
     def _of_part(self, analysis: Analysis) -> CellGradient:
         """Return the gradient of the one value of this response (collective)."""
@@ -218,7 +218,10 @@ class MotionResponse(Response):
         if self.options.gradient == "esl" and not self.declared.exact:
             moments = on_root(world, lambda: self._frozen_moments(analysis.motion))
             with together(world):
-                return {k: esl_gradient(one, moments[k], analysis.by) for k, one in designs.items()}
+                return {
+                    k: esl_gradient(design, moments[k], analysis.by)
+                    for k, design in designs.items()
+                }
 
         def followed() -> dict[int, Any]:
             weights = self._weights_of_scenarios(analysis.motion)
@@ -226,23 +229,25 @@ class MotionResponse(Response):
 
         by = on_root(world, followed)
         with together(world):
-            own = {k: exact_gradient(one, by[k], by=analysis.by) for k, one in designs.items()}
+            own = {
+                k: exact_gradient(design, by[k], by=analysis.by) for k, design in designs.items()
+            }
         return own | {LAW: by[LAW]} if LAW in by else own
 
     def _weights_of_scenarios(self, trajectory: Trajectory) -> np.ndarray:
         """Return the derivatives of the value by those of `motions_of`."""
-        values = [self.of_motion(one) for one in motions_of(trajectory)]
+        values = [self.of_motion(item) for item in motions_of(trajectory)]
         return self.combine(trajectory.scene, values)[1]
 
     def _frozen_moments(self, trajectory: Trajectory) -> dict[int, np.ndarray]:
         """Return `load_case_moments` of every design, of all scenarios together."""
-        scene, found = trajectory.scene, list[tuple[int, np.ndarray]]()
+        scene, result = trajectory.scene, list[tuple[int, np.ndarray]]()
         weights = self._weights_of_scenarios(trajectory)
-        for weight, one in zip(weights, motions_of(trajectory), strict=True):
-            moments = self.load_case_moments(one)[: len(scene.arms)]
-            scales = [weight * factors(scene, one.scene, k).stiffness for k in range(len(moments))]
-            found += by_owner(scene, list(map(np.multiply, scales, moments))).items()
-        return sums(found)
+        for weight, item in zip(weights, motions_of(trajectory), strict=True):
+            moments = self.load_case_moments(item)[: len(scene.arms)]
+            scales = [weight * factors(scene, item.scene, k).stiffness for k in range(len(moments))]
+            result += by_owner(scene, list(map(np.multiply, scales, moments))).items()
+        return sums(result)
 
 
 def motions_of(trajectory: Trajectory) -> tuple[Trajectory, ...]:
@@ -270,23 +275,23 @@ def over_motions(
     scene, nominal, profile = analysis.scene, analysis.motion.feed_forward, analysis.profile
     parts: list[tuple[int, Any]] = []
     by_coefficients: list[np.ndarray] = []
-    for number, one in enumerate(motions_of(analysis.motion)):
+    for number, item in enumerate(motions_of(analysis.motion)):
         with profile.phase("adjoint"):
-            found = of_motion(number, one)
-        if found is None:
+            result = of_motion(number, item)
+        if result is None:
             continue
         profile.counts.adjoints += 1
         weight = 1.0 if weights is None else weights[number]
-        if one.feed_forward is not nominal:
-            found = Followed(found.through(one.feed_forward))
-        if found.by_coefficients is not None:
-            by_coefficients.append(weight * found.by_coefficients)
-        if found.by_law is not None:
-            parts.append((LAW, weight * found.by_law))
-        bodies = found.bodies[: len(scene.arms)]
-        if one.scene is not scene:
+        if item.feed_forward is not nominal:
+            result = Followed(result.through(item.feed_forward))
+        if result.by_coefficients is not None:
+            by_coefficients.append(weight * result.by_coefficients)
+        if result.by_law is not None:
+            parts.append((LAW, weight * result.by_law))
+        bodies = result.bodies[: len(scene.arms)]
+        if item.scene is not scene:
             bodies = [
-                cotangents_of_scene(by, factors(scene, one.scene, k), weight)
+                cotangents_of_scene(by, factors(scene, item.scene, k), weight)
                 for k, by in enumerate(bodies)
             ]
         parts += by_owner(scene, bodies).items()
@@ -469,7 +474,7 @@ class DriveResponse(MotionResponse):
         by = np.zeros_like(trajectory.joint_forces)
         by[np.ix_(cases.indices, columns)] = by_y * weights
         by_rates, by_motion, bodies = trajectory.drive_forces.gradient(by)
-        own = [integrals_of(one) for one in bodies]
+        own = [integrals_of(body) for body in bodies]
         return ByMotion(by_rates[:, cases.indices], own, by_motion[:, cases.indices])
 
     def counted(self, scene: Scene) -> tuple[int, ...]:
@@ -519,8 +524,8 @@ class PeakForce(PMean, DriveResponse):
 
     def restricted(self, limits: Sequence[float | None]) -> tuple[Response, tuple[float, ...]]:
         """Return the response of those drives that have a limit, and these limits."""
-        drives = tuple(k for k, one in enumerate(limits) if one is not None)
-        kept = tuple(one for one in limits if one is not None)
+        drives = tuple(k for k, limit in enumerate(limits) if limit is not None)
+        kept = tuple(limit for limit in limits if limit is not None)
         return PeakForce(self.options, self.limited, drives), kept
 
     def parts(self, scene: Scene) -> Sequence[tuple[str, MotionResponse]]:

@@ -88,12 +88,12 @@ def choose_coordinates(
         tried[count] = comparison.error(count)
         return tried[count] <= goal  # not a number does not
 
-    found = fewest(least, most, holds)
-    if found is None:
+    result = fewest(least, most, holds)
+    if result is None:
         raise _none_found(scene, tried, goal)
     for arm in arms.values():
-        arm.set_order(found)
-    return OrderSelection(found, tried[found], tuple(sorted(tried.items())))
+        arm.set_order(result)
+    return OrderSelection(result, tried[result], tuple(sorted(tried.items())))
 
 
 def _none_found(scene: Scene, tried: Mapping[int, float], goal: float) -> ConvergenceError:
@@ -125,7 +125,7 @@ class Comparison:
     ):
         """Take what `evaluate` does (collective)."""
         self.partition, self.profile = partition, profile
-        self.scenes = [_timed(one) for one in (scene, *pose_scenarios(scene))]
+        self.scenes = [_timed(item) for item in (scene, *pose_scenarios(scene))]
         with together(partition.world):
             for k, arm in arms.items():
                 arm.state(x_phys[k])
@@ -157,7 +157,7 @@ class Comparison:
         def largest() -> float:
             assert motion is not None and self.motion is not None
             few, many = [motion, *motion.scenarios], [self.motion, *self.motion.scenarios]
-            return max(_distance(self.scenes[0], *one, energy) for one in zip(few, many))
+            return max(_distance(self.scenes[0], *item, energy) for item in zip(few, many))
 
         return on_root(self.partition.world, largest)
 
@@ -236,14 +236,14 @@ class Reductions:
 
     def bodies(self, bases: Mapping[int, Basis]) -> dict[int, ShapeIntegrals]:
         """Return the bodies of all arms with these bases, on the root (collective)."""
-        found = {}
+        result = {}
         with together(self.partition.world):
             for k, basis in bases.items():
                 arm, loads = self.arms[k], None
                 if arm.stiffened:
                     loads = arm.current.unit_loads.with_modes(basis.V, basis.MV)
-                found[k] = shape_integrals(arm.elastic, basis, self._damping, loads)
-        return gather_arms(self.partition, found)
+                result[k] = shape_integrals(arm.elastic, basis, self._damping, loads)
+        return gather_arms(self.partition, result)
 
     def energies(
         self, bases: Mapping[int, Basis], others: Mapping[int, Basis]

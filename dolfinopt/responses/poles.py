@@ -60,11 +60,11 @@ class PoleResponse(MotionResponse):
 
     def quantity(self, trajectory: Trajectory) -> np.ndarray:
         """Return the values of the poles at all instants (n, P); `of_none` of fewer."""
-        rows = [self.of_poles(one.values, trajectory.scene) for one in _poles(trajectory)]
-        found = np.full((len(rows), max(map(len, rows))), self.of_none)
-        for row, values in zip(found, rows, strict=True):
+        rows = [self.of_poles(pole.values, trajectory.scene) for pole in _poles(trajectory)]
+        result = np.full((len(rows), max(map(len, rows))), self.of_none)
+        for row, values in zip(result, rows, strict=True):
             row[: len(values)] = values
-        return found
+        return result
 
     def extreme(self, trajectory: Trajectory) -> float:
         """Return the least value of all poles."""
@@ -92,7 +92,7 @@ class PoleResponse(MotionResponse):
             by_rates.append(rates)
             bodies.append(own)
         total = [sum(own[1:], own[0]) for own in zip(*bodies, strict=True)]
-        return ByMotion(np.concatenate(by_rates, axis=1), [integrals_of(one) for one in total])
+        return ByMotion(np.concatenate(by_rates, axis=1), [integrals_of(item) for item in total])
 
 
 def _poles(trajectory: Trajectory) -> list[Poles]:

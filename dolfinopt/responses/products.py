@@ -105,8 +105,8 @@ def by_densities(state: DesignState, products: Products) -> np.ndarray:
         masses += elastic.cell_mass_products(left, right)
     if products.prestress is not None:
         energies += products.prestress.direct
-    found = state.young_slope * energies + state.density_slope * masses
-    return found if products.densities is None else found + products.densities
+    result = state.young_slope * energies + state.density_slope * masses
+    return result if products.densities is None else result + products.densities
 
 
 def by_nodes(state: DesignState, products: Products) -> np.ndarray:

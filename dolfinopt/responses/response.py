@@ -139,7 +139,7 @@ class Response(ABC):
             limits: of every value, None where it has none; or what the scene states in place of
                 one number.
         """
-        return self, tuple(one for one in limits if one is not None)
+        return self, tuple(limit for limit in limits if limit is not None)
 
     @abstractmethod
     def measure(self, analysis: Analysis) -> Measured:
@@ -155,13 +155,13 @@ class Response(ABC):
     def once(self, analysis: Analysis, find: Callable[[], Mapping[int, T]]) -> dict[int, T]:
         """Return what is found of this rank's designs, once for value and gradient (collective)."""
         states, trajectory = analysis.designs, analysis.trajectory
-        known = [one.kept.get(self.name) for one in states.values()]
-        hit = all(one is not None and one[0] is trajectory for one in known)
+        known = [state.kept.get(self.name) for state in states.values()]
+        hit = all(item is not None and item[0] is trajectory for item in known)
         # The root, which has an arm and the trajectory, speaks for all: they work in step.
         if not analysis.partition.world.bcast(hit, root=0):
-            for k, found in find().items():
-                states[k].kept[self.name] = trajectory, found
-        return {k: one.kept[self.name][1] for k, one in states.items()}
+            for k, result in find().items():
+                states[k].kept[self.name] = trajectory, result
+        return {k: state.kept[self.name][1] for k, state in states.items()}
 
     def smooth_of(self, values: np.ndarray) -> np.ndarray:
         """Return what the smooth value is of single true values, but for a factor.
@@ -251,14 +251,14 @@ def constraints_of(scene: Scene) -> list[Constraint]:
     """Return what the scene limits: the volume, then [constraints] in the order of its keys."""
     volume = scene.design.volume_fraction if scene.designed else None
     limits = ({} if volume is None else {"volume_fraction": volume}) | scene.constraints.limits
-    found = []
+    result = []
     for key, limit in limits.items():
         response = find_limited(key)(scene.objective, limited=True)
         if isinstance(limit, tuple):
-            found.append(Constraint(key, *response.restricted(limit)))
+            result.append(Constraint(key, *response.restricted(limit)))
         else:
-            found.append(Constraint(key, response, limit))
-    return found
+            result.append(Constraint(key, response, limit))
+    return result
 
 
 def needs(scene: Scene, what: Need) -> bool:
@@ -386,7 +386,7 @@ def combined(
     "sum": sum w f. "worst": the smooth largest of w f, with `objective.exponent`; or with `least`,
     of what is maximised, the smooth smallest.
     """
-    weights = np.array([one.weight for one in scene.scenarios] or [1.0])
+    weights = np.array([scenario.weight for scenario in scene.scenarios] or [1.0])
     if scene.objective.scenarios == "sum":
         return float(weights @ values), weights
     worst, by_values = worst_of(weights * values, scene.objective.exponent, least)

@@ -97,12 +97,12 @@ def _body_products(
     partners.left[:, :, 1:-1] += fields.mass
     places = partners.by_points
     stiffness: list[Pair] = [(combine(V, by_K.T) - fields.stiffness, V)]
-    for one in (geometric, displaced):
-        if one is not None:
+    for item in (geometric, displaced):
+        if item is not None:
             # The partners of X and 1_x stand at the ends, those of the modes between them.
-            partners.left[:, :, [-1, 0]] += one.by_inertia
-            places = places + one.by_inertia[:, :, 1]
-            partners.left[:, :, 1:-1] += one.by_modal_inertia
+            partners.left[:, :, [-1, 0]] += item.by_inertia
+            places = places + item.by_inertia[:, :, 1]
+            partners.left[:, :, 1:-1] += item.by_modal_inertia
     if displaced is not None:
         stiffness.append((displaced.adjoint, displaced.static))
     interfaces = partial(_at_interfaces, state, by_V, fields, geometric, displaced)

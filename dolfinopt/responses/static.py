@@ -45,24 +45,24 @@ class MaterialResponse(Response):
         """Return the values, and beside each the volume of its solid arms (values, 2)."""
         rows, depth, parts = self.rows(analysis.scene), depths(analysis.scene), {}
         with together(analysis.partition.world):
-            for k, one in analysis.designs.items():
-                own = one.mesh.area @ self.per_volume(one)[0], one.kind.volume.sum()
+            for k, design in analysis.designs.items():
+                own = design.mesh.area @ self.per_volume(design)[0], design.kind.volume.sum()
                 parts[k] = np.zeros((1 + max(rows.values()), 2))
                 parts[k][rows[k]] = depth[k] * np.array(own)
         return sum_over_arms(analysis.partition, parts)
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the derivatives by the densities, or by the cells' volumes (collective)."""
-        rows, depth, found = self.rows(analysis.scene), depths(analysis.scene), {}
+        rows, depth, result = self.rows(analysis.scene), depths(analysis.scene), {}
         with together(analysis.partition.world):
-            for k, one in analysis.designs.items():
-                amount, slope = self.per_volume(one)
+            for k, design in analysis.designs.items():
+                amount, slope = self.per_volume(design)
                 products = Products(
-                    densities=depth[k] * slope * one.mesh.area, volumes=depth[k] * amount
+                    densities=depth[k] * slope * design.mesh.area, volumes=depth[k] * amount
                 )
-                found[k] = analysis.by(one, products)
+                result[k] = analysis.by(design, products)
         return [
-            {k: one for k, one in found.items() if rows[k] == row}
+            {k: item for k, item in result.items() if rows[k] == row}
             for row in range(1 + max(rows.values()))
         ]
 
@@ -169,25 +169,25 @@ class StaticResponse(Response):
         """Return every value (collective)."""
         cases, mine = self.cases(analysis.scene), {}
         with together(analysis.partition.world):
-            for number, one in enumerate(cases):
-                if one.owner in analysis.designs:
-                    found = static_response(analysis.designs[one.owner].elastic, one.loads)
-                    mine[number] = self.value(one, found.tip[: one.loads.shape[1]])
+            for number, case in enumerate(cases):
+                if case.owner in analysis.designs:
+                    result = static_response(analysis.designs[case.owner].elastic, case.loads)
+                    mine[number] = self.value(case, result.tip[: case.loads.shape[1]])
         true, smooth = zip(*on_all_ranks(analysis.partition, mine).values(), strict=True)
-        return Measured(self.name, tuple(one.name for one in cases), true, smooth)
+        return Measured(self.name, tuple(item.name for item in cases), true, smooth)
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of every value, by one adjoint load a load case (collective)."""
         rows, designs = [], analysis.designs
         with together(analysis.partition.world):
-            for one in self.cases(analysis.scene):
+            for case in self.cases(analysis.scene):
                 row = {k: analysis.by(state, Products()) for k, state in designs.items()}
-                if one.owner in designs:
-                    state, count = designs[one.owner], one.loads.shape[1]
-                    found = static_response(state.elastic, one.loads)
-                    by = np.zeros_like(found.tip)
-                    by[:count] = self.gradient(one, found.tip[:count])
-                    row[one.owner] = tip_gradient(state, by, found.loads, analysis.by)
+                if case.owner in designs:
+                    state, count = designs[case.owner], case.loads.shape[1]
+                    result = static_response(state.elastic, case.loads)
+                    by = np.zeros_like(result.tip)
+                    by[:count] = self.gradient(case, result.tip[:count])
+                    row[case.owner] = tip_gradient(state, by, result.loads, analysis.by)
                 rows.append(row)
         return rows
 
@@ -198,8 +198,8 @@ class StaticCompliance(StaticResponse):
 
     def value(self, case: LoadedArm, tip: np.ndarray) -> tuple[float, float]:
         """Return sum load . displacement over the load cases."""
-        found = case.factor * float(np.sum(case.loads.T * tip))
-        return found, found
+        result = case.factor * float(np.sum(case.loads.T * tip))
+        return result, result
 
     def gradient(self, case: LoadedArm, tip: np.ndarray) -> np.ndarray:
         """Return the loads."""
@@ -248,20 +248,20 @@ class Stiffness(TipDeflection):
 
     def restricted(self, limits: Sequence[StiffnessCase]) -> tuple[Response, tuple[float, ...]]:
         """Return the response of these cases, and the limits of their values."""
-        found = Stiffness(self.options, self.limited, limits)
+        result = Stiffness(self.options, self.limited, limits)
         both = (limit for case in limits for limit in (case.displacement, case.rotation))
-        return found, tuple(one for one in both if one is not None)
+        return result, tuple(item for item in both if item is not None)
 
     def cases(self, scene: Scene) -> Sequence[LoadedArm]:
         """Return the displacement and the rotation of every case that limits them."""
         owners = {arm.name: k for arm, k in zip(scene.arms, scene.owners, strict=True)}
-        found, d = [], scene.dimension
+        result, d = [], scene.dimension
         for number, case in enumerate(self.limits, 1):
             name, loads, owner = f"{case.arm}_case{number}", np.array([case.load]), owners[case.arm]
             assert owner is not None  # the scene has checked that
             if case.displacement is not None:
-                found.append(LoadedArm(name, owner, loads, slice(d)))
+                result.append(LoadedArm(name, owner, loads, slice(d)))
             if case.rotation is not None:
                 turned = slice(d, loads.shape[1])
-                found.append(LoadedArm(name + ROTATION, owner, loads, turned))
-        return found
+                result.append(LoadedArm(name + ROTATION, owner, loads, turned))
+        return result

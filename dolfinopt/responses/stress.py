@@ -203,19 +203,19 @@ class ArmLoads:
 
 def every_instant(loads: Sequence[ArmLoads]) -> np.ndarray:
     """Return the coefficients (n, m) of all instants of all motions."""
-    return np.concatenate([one.coefficients for one in loads])
+    return np.concatenate([load.coefficients for load in loads])
 
 
 def arm_loads(scene: Scene, motions: Sequence[Trajectory]) -> dict[int, list[ArmLoads]]:
     """Return the loads of every arm with a design, by the index of the arm that owns it."""
-    found: dict[int, list[ArmLoads]] = {owner: [] for owner in scene.cell_counts}
+    result: dict[int, list[ArmLoads]] = {owner: [] for owner in scene.cell_counts}
     for number, motion in enumerate(motions):
         for place, owner in enumerate(scene.owners):
             if owner is not None:
                 stiffer = motion.scene.material_of(owner).modulus / scene.material_of(owner).modulus
                 a = _coefficients(scene, motion, place)
-                found[owner].append(ArmLoads(place, number, a, stiffer, np.arange(len(a))))
-    return found
+                result[owner].append(ArmLoads(place, number, a, stiffer, np.arange(len(a))))
+    return result
 
 
 def load_matrix(body: ShapeIntegrals) -> np.ndarray:
@@ -235,16 +235,16 @@ def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ByLoads])
         by_arms: the function's derivatives.
     """
     mechanism = motion.mechanism
-    instants = np.unique(np.concatenate([one.instants for one in by_arms]))
+    instants = np.unique(np.concatenate([arm.instants for arm in by_arms]))
     by_q = np.zeros((len(instants), mechanism.num_coordinates))
     by_c = [np.zeros((len(instants), load_counts(body).total)) for body in mechanism.bodies]
     own: list[list[dict[str, np.ndarray]]] = [[] for _ in mechanism.bodies]
-    for one in by_arms:
-        k, rows = one.place, np.searchsorted(instants, one.instants)
+    for arm in by_arms:
+        k, rows = arm.place, np.searchsorted(instants, arm.instants)
         body = mechanism.bodies[k]
-        by = one.by * _scale(scene, motion.scene, k, body)
+        by = arm.by * _scale(scene, motion.scene, k, body)
         by_modes, by_loads = np.split(by, [body.num_modes], axis=1)
-        c, P = motion.load_coefficients[k][one.instants], load_matrix(body)
+        c, P = motion.load_coefficients[k][arm.instants], load_matrix(body)
         z = -np.linalg.solve(body.K, by_modes.T)
         by_q[rows, mechanism.slices[k]] += by_modes
         by_c[k][rows] += by_loads + z.T @ P
@@ -257,8 +257,8 @@ def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ByLoads])
 
     def value(moved: Trajectory) -> float:
         return sum(
-            float(np.vdot(one.by, _coefficients(scene, moved, one.place)[one.instants]))
-            for one in by_arms
+            float(np.vdot(item.by, _coefficients(scene, moved, item.place)[item.instants]))
+            for item in by_arms
         )
 
     followed = motion.followed(t, by_rates, by_motion, value)
@@ -316,25 +316,25 @@ class Stress(Response):
 
     def measure(self, analysis: Analysis) -> Measured:
         """Return largest stress and p-mean over all arms and scenarios (collective)."""
-        found = next(iter(self._found(analysis).values()), None)
-        sums: PowerSum = analysis.partition.world.bcast(found and found.sums, root=0)
+        result = next(iter(self._found(analysis).values()), None)
+        sums: PowerSum = analysis.partition.world.bcast(result and result.sums, root=0)
         return Measured(self.name, ("",), (sums.largest,), (sums.smooth,))
 
     def gradients(self, analysis: Analysis) -> list[CellGradient]:
         """Return the gradient of the p-mean, see `objective.gradient` (collective)."""
-        found, parts = self._found(analysis), {}
+        result, parts = self._found(analysis), {}
         with together(analysis.partition.world):
-            for k, one in found.items():
+            for k, item in result.items():
                 state = analysis.designs[k]
-                by_u, beside = _by_displacements(one, state)
-                if not len(every_instant(one.loads)):
+                by_u, beside = _by_displacements(item, state)
+                if not len(every_instant(item.loads)):
                     parts[k] = ArmGradient([], None, (replace(beside, stress=None),))
                 elif self.options.gradient == "esl":
-                    parts[k] = ArmGradient([], None, (beside, _frozen_loads(one, state, by_u)))
+                    parts[k] = ArmGradient([], None, (beside, _frozen_loads(item, state, by_u)))
                 else:
                     with analysis.profile.phase("gradient"):
-                        displaced = one.points.fields.gradient(every_instant(one.loads), by_u)
-                    parts[k] = ArmGradient(one.by_loads(displaced.by_a), displaced, (beside,))
+                        displaced = item.points.fields.gradient(every_instant(item.loads), by_u)
+                    parts[k] = ArmGradient(item.by_loads(displaced.by_a), displaced, (beside,))
         return [through_motions(analysis, parts)]
 
     def points_of(self, index: int, state: DesignState, fields: LoadFields) -> PointStress:
@@ -367,24 +367,26 @@ class Stress(Response):
                 points[k] = self.points_of(k, state, state.load_fields)
                 with analysis.profile.phase("stress"):
                     own = partial(screen, partition.comm, points[k].A)
-                    screened[k] = [own(one.coefficients) for one in by_owner[k]]
-        each = [(one.largest, one.summed.max()) for own in screened.values() for one in own]
+                    screened[k] = [own(item.coefficients) for item in by_owner[k]]
+        each = [(item.largest, item.summed.max()) for own in screened.values() for item in own]
         # The largest of all may lie between the instants that are summed.
         largest, summed = np.max(world.allgather(np.max([(0.0, 0.0), *each], axis=0)), axis=0)
         cut, sums = NEGLIGIBLE_POWER_SHARE ** (1.0 / p) * summed, {}
-        counts = {k: sum(len(one.summed) for one in own) for k, own in screened.items()}
+        counts = {k: sum(len(item.summed) for item in own) for k, own in screened.items()}
         with together(world), analysis.profile.phase("stress"):
-            for k, one in points.items():
+            for k, point in points.items():
                 pairs = zip(by_owner[k], screened[k], strict=True)
                 by_owner[k] = [
                     loads.at(found.counted[found.summed >= cut]) for loads, found in pairs
                 ]
                 a = every_instant(by_owner[k])
-                total = one.power_sum(a, largest, p) if largest else 0.0
-                sums[k] = np.array([total, one.weights.sum() * counts[k]])
+                total = point.power_sum(a, largest, p) if largest else 0.0
+                sums[k] = np.array([total, point.weights.sum() * counts[k]])
         total, weight = sum_over_arms(partition, sums)
-        found = PowerSum(largest, float(total), float(weight), p)
-        return {k: StressedDesign(one, by_owner[k], counts[k], found) for k, one in points.items()}
+        result = PowerSum(largest, float(total), float(weight), p)
+        return {
+            k: StressedDesign(item, by_owner[k], counts[k], result) for k, item in points.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -427,10 +429,10 @@ class StressedDesign:
 
     def by_loads(self, by_a: np.ndarray) -> list[ByLoads]:
         """Return derivatives by all coefficients (k, m), dealt out to the motions."""
-        ends = np.cumsum([len(one.instants) for one in self.loads])[:-1]
+        ends = np.cumsum([len(load.instants) for load in self.loads])[:-1]
         return [
-            ByLoads(one.motion, one.place, one.instants, by)
-            for one, by in zip(self.loads, np.split(by_a, ends), strict=True)
+            ByLoads(load.motion, load.place, load.instants, by)
+            for load, by in zip(self.loads, np.split(by_a, ends), strict=True)
             if len(by)
         ]
 
@@ -504,13 +506,13 @@ class ArmGradient:
 def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> CellGradient:
     """Follow derivatives of this rank's arms through the motions to all designs (collective)."""
     partition, designs = analysis.partition, analysis.designs
-    by_arm = gather_arms(partition, {k: one.by_loads for k, one in mine.items()})
+    by_arm = gather_arms(partition, {k: item.by_loads for k, item in mine.items()})
 
     def followed() -> dict[int, Any]:
-        every = [one for each in by_arm.values() for one in each]
+        every = [item for each in by_arm.values() for item in each]
 
         def of_motion(number: int, motion: Trajectory) -> Followed | None:
-            own = [one for one in every if one.motion == number]
+            own = [item for item in every if item.motion == number]
             return loads_gradient(analysis.scene, motion, own) if own else None
 
         return over_motions(analysis, of_motion)
@@ -518,10 +520,10 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
     by_body: dict[int, Any] = on_root(partition.world, followed)
     row = {}
     with together(partition.world):
-        for k, one in mine.items():
-            by = [analysis.by(designs[k], each) for each in one.beside]
+        for k, item in mine.items():
+            by = [analysis.by(designs[k], each) for each in item.beside]
             if k in by_body:
-                by.append(exact_gradient(designs[k], by_body[k], one.displaced, analysis.by))
+                by.append(exact_gradient(designs[k], by_body[k], item.displaced, analysis.by))
             row[k] = np.sum(by, axis=0)
     return row | {LAW: by_body[LAW]} if LAW in by_body else row
 

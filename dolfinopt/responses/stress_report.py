@@ -109,9 +109,9 @@ def stress_report(
     profile.counts = counts
     every_peak, every_cell = gather_arms(partition, peaks), gather_cells(partition, cells)
     return {
-        one.place: ArmStress(*every_peak[k][n], *every_cell[k][:, n].T)
+        item.place: ArmStress(*every_peak[k][n], *every_cell[k][:, n].T)
         for k in every_peak
-        for n, one in enumerate(by_owner[k])
+        for n, item in enumerate(by_owner[k])
     }
 
 
@@ -136,11 +136,11 @@ def _of_design(
 
     def peak(found: Screened, places: np.ndarray) -> Peak:
         known = comm.allgather(places[found.point] if found.point >= 0 else None)
-        place = next(one for one in known if one is not None)
+        place = next(item for item in known if item is not None)
         return Peak(found.largest, tuple(map(float, place)), float(t[found.instant]))
 
-    for one in every:
-        a = one.coefficients
+    for item in every:
+        a = item.coefficients
         by_cell, when = maxima(comm, stress.A, a)
         largest = screen(comm, stress.A, a)
         if largest.point >= 0:  # the map is right to a thousandth
