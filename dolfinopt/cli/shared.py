@@ -165,7 +165,7 @@ def draw(
         limits_figure,
     )
     from dolfinopt.plots.design import design_figure, stress_figure
-    from dolfinopt.plots.machine import machine_figure
+    from dolfinopt.plots.machine import draw_motion, machine_figure
     from dolfinopt.plots.style import save
 
     title, bodies = scene.name, trajectory.mechanism.arms
@@ -186,8 +186,6 @@ def draw(
     if scene.motion.coefficients:
         save(law_figure(scene), folder / "law.png")
     if animation:
-        from dolfinopt.plots.animation import draw_motion
-
         draw_motion(folder / "motion.gif", views, trajectory)
 
 

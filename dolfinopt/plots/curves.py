@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.ticker import MaxNLocator
@@ -16,10 +16,12 @@ from dolfinopt.plots.style import (
     BLUE,
     FEW_POINTS,
     INITIAL,
-    LINE_WIDTH,
+    LEFT,
     MILLI,
     OPTIMISED,
     ORANGE,
+    TITLE,
+    headline,
     log_scale,
     look,
     look_numbers,
@@ -27,6 +29,7 @@ from dolfinopt.plots.style import (
     new_figure,
     shortened,
     spread,
+    styled,
 )
 from dolfinopt.responses.response import constraints_of, find_limited
 from dolfinopt.scene.duration import path_length, time_law
@@ -38,8 +41,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.part.check import Check
-    from dolfinopt.scene.duration import path_length, time_law
-from dolfinopt.scene.load import Scene
+    from dolfinopt.scene.load import Scene
 
 DEVIATION = "Deviation of the end-effector from the rigid path"
 LIMIT = "0.35"  # colour of limits
@@ -55,26 +57,26 @@ def panel_grid(used: np.ndarray, title: str, abscissa: str) -> tuple[Figure, np.
     """
     rows, columns = used.shape
     width, height = 5.0 * columns if columns > 1 else 9.0, 0.9 + 2.1 * rows
-    figure = new_figure(width, height, laid_out=False)
+    figure = new_figure(width, height)
     grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
     # Fixed margins, inches: there is nothing to be found out by drawing twice.
-    figure.subplots_adjust(left=0.85 / width, right=1.0 - 0.25 / width, wspace=0.2, hspace=0.32,
+    figure.subplots_adjust(left=LEFT / width, right=1.0 - 0.25 / width, wspace=0.2, hspace=0.32,
                            bottom=0.5 / height, top=1.0 - 0.75 / height)  # fmt: skip
     for axes, there in zip(grid.ravel(), used.ravel(), strict=True):
         axes.set_visible(there)
+        axes.grid(True, alpha=0.3)
     for column, there in zip(grid.T, used.T, strict=True):
         for last in column[there][-1:]:
             last.set_xlabel(abscissa)
             last.tick_params(labelbottom=True)
-    figure.suptitle(title, x=0.15 / width, y=1.0 - 0.12 / height, va="top", ha="left", fontsize=12)
+    headline(figure, title, 0.15)
     return figure, grid
 
 
 def _head(axes: Axes, label: str, note: str) -> None:
     """Write what a panel shows above it on the left, and its figures on the right."""
-    axes.set_title(label, loc="left", y=1.0, fontsize=10, parse_math=False)
-    axes.set_title(note, loc="right", y=1.0, fontsize=10)
-    axes.grid(True, alpha=0.3)
+    axes.set_title(label)
+    axes.set_title(note, loc="right")
 
 
 # -- history ---------------------------------------------------------------------------------
@@ -87,6 +89,7 @@ def history_of(scene: Scene, rows: Sequence[HistoryRow]) -> Figure:
     return history_figure(rows, f"{minimised.label} [{minimised.unit}]", limits)
 
 
+@styled
 def history_figure(
     rows: Sequence[HistoryRow], objective_label: str, limits: Mapping[str, float] | None = None
 ) -> Figure:
@@ -113,6 +116,7 @@ def history_figure(
     return figure
 
 
+@styled
 def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
     """Return the picture of how far limits are used, and what they cost.
 
@@ -142,7 +146,7 @@ def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
         every.append(used)
     log_scale(above, np.append(np.concatenate(every), 100.0))
     above.axhline(100.0, color=LIMIT, ls="--", lw=1.0)
-    above.legend(fontsize=8, ncols=3, loc="upper right")
+    above.legend(ncols=3, loc="upper right")
     _head(above, "share of the limit that is used [%]", "limit: 100 %")
     _head(below, "objective gained for 1 % of the limit [%]", "")
     below.set_ylim(bottom=0.0)
@@ -178,30 +182,17 @@ def _drawn(constraint: str) -> tuple[str, float]:
 
 
 def history_panels(rows: Sequence[HistoryRow], objective_label: str) -> dict[str, np.ndarray]:
-    """Return label and values (n,) of every panel; what the rows do not have is left out.
-
-    A mapping of numbers in a row (constraints by name) gives a panel for each of its keys.
-    """
-    known = {"iteration", "objective", "seconds", *HISTORY}
+    """Return label and values (n,) of every panel; what is nowhere known is left out."""
     panels = {objective_label: np.array([row.objective for row in rows])}
+    limited = rows[0].constraints
     for name, (label, factor) in HISTORY.items():
-        limited = name == "max_deviation" and "deviation" in getattr(rows[0], "constraints", {})
-        if hasattr(rows[0], name) and not limited:  # its limit has a panel of the same values
-            panels[label] = factor * _numbers([getattr(row, name) for row in rows])
-    for name, value in vars(rows[0]).items():
-        if name == "multipliers":  # in a picture of their own
-            continue
-        if isinstance(value, Mapping):
-            for key in value:
-                label, factor = _drawn(str(key))
-                panels[label] = factor * _numbers([getattr(row, name).get(key) for row in rows])
-        elif name not in known and isinstance(value, (int, float)):
-            panels[name.replace("_", " ")] = _numbers([getattr(row, name) for row in rows])
-    return {label: v for label, v in panels.items() if np.isfinite(v).any()}
-
-
-def _numbers(values: Sequence[float | None]) -> np.ndarray:
-    return np.array([np.nan if value is None else float(value) for value in values])
+        if name != "max_deviation" or "deviation" not in limited:  # a panel of the same values
+            panels[label] = factor * np.array([getattr(row, name) for row in rows])
+    for name in limited:
+        label, factor = _drawn(name)
+        values: Any = [row.constraints.get(name) for row in rows]
+        panels[label] = factor * np.array(values, dtype=float)
+    return {label: values for label, values in panels.items() if np.isfinite(values).any()}
 
 
 def _draw_history_panel(
@@ -213,7 +204,7 @@ def _draw_history_panel(
     if not linear:  # nothing has changed yet at the first row; zero has no logarithm
         values = np.where(positive, values, np.nan) if positive.any() else values
     marker = "o" if len(values) <= FEW_POINTS else ""
-    axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, lw=LINE_WIDTH, clip_on=False)
+    axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, clip_on=False)
     finite, ends = values[np.isfinite(values)], ""
     if limit is not None:
         axes.axhline(limit, color=LIMIT, ls="--", lw=1.0)
@@ -248,6 +239,7 @@ def deviation_title(trajectory: Trajectory) -> str:
     return "Deviation of the end-effector from the desired path" if controlled else DEVIATION
 
 
+@styled
 def deviation_figure(
     t: np.ndarray,
     deviation: np.ndarray,
@@ -266,7 +258,7 @@ def deviation_figure(
         title: above the picture, of what from what.
         limits: m, each with the first and the last instant at which it holds, s.
     """
-    figure = new_figure(9.0, 5.0, 120, laid_out=False)
+    figure = new_figure(9.0, 5.0)
     axes = figure.add_axes((0.1, 0.11, 0.88, 0.81))  # room for ticks such as 0.00025
     curves = [("", t, deviation)]
     if initial is not None and len(initial):
@@ -291,22 +283,22 @@ def deviation_figure(
             xytext=((when - t[0]) / (t[-1] - t[0]) + (-0.02 if late else 0.02), height + 0.02),
             textcoords="axes fraction",
             ha="right" if late else "left",
-            fontsize=10,
             color=style["color"],
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
         )
     _over_time(axes, t, "deviation [mm]", limits)
     axes.set(ylim=(0.0, top), xlabel="time [s]")
-    axes.set_title(title, loc="left", fontsize=12)
+    axes.set_title(title, fontsize=TITLE)
     return figure
 
 
+@styled
 def check_figure(check: Check, scene: Scene) -> Figure:
     """Return the picture of the deviation over time with every form of the arms, mm.
 
     Below, by how much that of other forms differs from that of the densities.
     """
-    figure = new_figure(9.0, 6.4, 120, laid_out=False)
+    figure = new_figure(9.0, 6.4)
     upper = figure.add_axes((0.1, 0.42, 0.88, 0.51))
     lower = figure.add_axes((0.1, 0.09, 0.88, 0.24))
     first, styles = check.density.trajectory, looks([list(check.columns)])
@@ -322,11 +314,11 @@ def check_figure(check: Check, scene: Scene) -> Figure:
             lower.plot(own.t, less, label=f"{name} less density", **style)
     _over_time(upper, first.t, "deviation [mm]", deviation_limits(scene))
     _over_time(lower, first.t, "difference [mm]")
-    upper.set_title(deviation_title(first), loc="left", fontsize=12)
+    upper.set_title(deviation_title(first), fontsize=TITLE)
     upper.set_ylim(0.0, None)
     lower.set_xlabel("time [s]")
     for axes in (upper, lower):
-        axes.legend(fontsize=9, frameon=True, framealpha=0.8, edgecolor="none")
+        axes.legend()
     figure.align_ylabels([upper, lower])
     return figure
 
@@ -353,6 +345,7 @@ SCALES = {
 }
 
 
+@styled
 def drives_figure(trajectory: Trajectory) -> Figure:
     """Return the picture of a machine's drives over time, and of what holds a closed loop.
 
@@ -370,9 +363,9 @@ def drives_figure(trajectory: Trajectory) -> Figure:
         largest = max(float(np.abs(values).max()) for values in curves.values())
         factor, shown = next((f, name) for limit, f, name in SCALES[unit] if largest < limit)
         for (name, values), colour in zip(curves.items(), (BLUE, ORANGE), strict=False):
-            axes.plot(t, factor * values, color=colour, lw=LINE_WIDTH, label=name)
+            axes.plot(t, factor * values, color=colour, label=name)
         if len(curves) > 1:
-            axes.legend(loc="best", frameon=False, fontsize=9, ncols=len(curves))
+            axes.legend(ncols=len(curves))
         axes.axhline(0.0, color="black", lw=0.6, zorder=1.0)
         axes.set_xlim(t[0], t[-1])
         _head(axes, f"{label} [{shown}]", f"largest {factor * largest:.3g}")
@@ -411,6 +404,7 @@ def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
 # -- the law of the motion -----------------------------------------------------------------------
 
 
+@styled
 def law_figure(scene: Scene) -> Figure:
     """Return the picture of a designed law: way, speed and acceleration, with those before."""
     motion = scene.motion
@@ -425,11 +419,11 @@ def law_figure(scene: Scene) -> Figure:
         zip(grid[:, 0], ("way", "speed", "acceleration"), strict=True)
     ):
         for (name, one), colour in zip(values.items(), (BLUE, ORANGE), strict=False):
-            axes.plot(t, length * one[k], color=colour, lw=LINE_WIDTH, label=name)
+            axes.plot(t, length * one[k], color=colour, label=name)
         axes.set_xlim(t[0], t[-1])
         largest = length * np.abs(values["designed"][k]).max()
         _head(axes, f"{word} [{units[k]}]", f"largest {largest:.3g}")
-    grid[0, 0].legend(loc="best", frameon=False, fontsize=9)
+    grid[0, 0].legend()
     return figure
 
 

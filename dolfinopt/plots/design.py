@@ -1,4 +1,4 @@
-"""Pictures of arms below each other, to one scale: densities, stress, parts."""
+"""Pictures of arms below each other, to one scale: densities, stress, parts; plane and solid."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from dolfinopt.plots.style import (
     colour_scale,
     round_number,
     stacked_axes,
+    styled,
 )
 
 if TYPE_CHECKING:
@@ -33,18 +34,20 @@ if TYPE_CHECKING:
 
 REGION = {"solid": ORANGE, "void": BLUE}  # borders of what stays solid and void
 STRESS_COLOURS = "YlOrRd"  # nothing is light, the largest dark
-STRESS = "largest von Mises stress along the motion [MPa]"
+WALL_COLOURS = "viridis_r"
+STRESS, WALL = "largest von Mises stress along the motion [MPa]", "thickness of the wall [mm]"
 MEGA = 1e-6
 LOW = 0.45  # inches, least height of an arm's axes
 PLATE = 1.0  # inches, likewise of a plate
-FOOT = 1.35  # inches, for the label of x and the scale of colours
-LABEL_FOOT = 0.6  # for the label of x alone
+SCALE_FOOT = 0.75  # inches, for the scale of colours
+LABEL_FOOT = 0.6  # inches, for the label of x
 MARGIN = 0.012  # of the arms' length, around them
 FACE, BRIGHT, DARK = "#b8c4cc", np.array([0.62, 0.68, 0.72]), np.array([0.20, 0.26, 0.31])
 DEPTH = np.array([0.35, 0.35])  # by which a plate's back is moved, of its thickness
 CHORD = 0.02  # of drawn curves, cells
 
 
+@styled
 def design_figure(
     views: Sequence[ArmView], title: str, masses: Mapping[str, float] | None = None
 ) -> Figure:
@@ -55,57 +58,71 @@ def design_figure(
         title: above the picture.
         masses: of solid arms by name, kg, if they are known.
     """
-    if is_solid(views):
-        from dolfinopt.plots.solid_design import solid_design_figure
+    if not is_solid(views):
+        return _densities_figure(views, title)
+    from dolfinopt.plots.solid import caption
 
-        return solid_design_figure(views, title, masses)
-    figure, rows = _arm_rows([view.corners for view in views], title, "m", FOOT)
+    thickest = max((MILLI * float(v.wall.max()) for v in views if v.wall is not None), default=0.0)
+    marks = scale_marks(thickest)
+    figure, rows = _panels(views, title, thickest > 0.0)
     for axes, view in zip(rows, views, strict=True):
-        _fill(axes, view.corners, view.density)
-        _draw_rim(axes, view.corners)
+        wall = None if view.wall is None else MILLI * view.wall
+        _draw_arm(axes, view, wall, WALL_COLOURS, marks[-1])
+        axes.set_title(caption(view, (masses or {}).get(view.name)))
+    if thickest:
+        colour_scale(figure, WALL, WALL_COLOURS, marks)
+    return figure
+
+
+def _densities_figure(views: Sequence[ArmView], title: str) -> Figure:
+    """Return the picture of plane arms: densities, regions, joint axes."""
+    figure, rows = _panels(views, title, True)
+    for axes, view in zip(rows, views, strict=True):
+        _draw_arm(axes, view, view.density, COLOURS, 1.0)
+        low, high = bounds(view)
         for kind, border in view.regions:
-            low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
             axes.fill(*np.clip(border, low, high).T, fc="none", ec=REGION[kind], lw=1.2,
                       label=f"stays {kind}")  # fmt: skip
         if view.length is not None:
-            axes.plot([0.0, view.length], [0.0, 0.0], "o", mfc="white", mec="black", ms=5.5,
-                      clip_on=False)  # fmt: skip
-        axes.set_title(_caption(view), loc="left", fontsize=10, parse_math=False)
+            axes.plot([0.0, view.length], [0.0, 0.0], "o", mfc="white", mec="black", clip_on=False)
+        axes.set_title(_caption(view))
     keys = {key: one for axes in rows for one, key in zip(*axes.get_legend_handles_labels())}
     if keys:
-        figure.legend(list(keys.values()), list(keys), loc="lower left", frameon=False, fontsize=9)
+        figure.legend(list(keys.values()), list(keys), loc="lower left")
     colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))
     return figure
 
 
+@styled
 def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     """Return the picture of the largest stress of every cell, the place of the largest ringed.
+
+    On solids what is denser than one half is drawn; the ring may be on the side that is not seen.
 
     Args:
         views: of arms whose stress is known, from the cart outwards, all plane or all solid.
         title: above the picture.
     """
-    if is_solid(views):
-        from dolfinopt.plots.solid_design import solid_stress_figure
-
-        return solid_stress_figure(views, title)
-    figure, rows = _arm_rows([view.corners for view in views], title, "m", FOOT)
-    stresses = [MEGA * known_stress(view)[0] for view in views]
+    figure, rows = _panels(views, title, True)
+    stresses = [MEGA * view.stress for view in views if view.stress is not None]
     largest = max(float(stress.max()) for stress in stresses)
     marks = scale_marks(largest)
     for axes, view, stress in zip(rows, views, stresses, strict=True):
-        _fill(axes, view.corners, stress, STRESS_COLOURS, marks[-1])
-        _draw_rim(axes, view.corners)
-        worst = int(np.argmax(stress))
-        (x, y), when = view.centroid[worst], known_stress(view)[1][worst]
+        _draw_arm(axes, view, stress, STRESS_COLOURS, marks[-1])
+        worst, when = int(np.argmax(stress)), view.stress_instant
+        assert when is not None
         if stress[worst] == largest > 0.0:
-            draw_ring(axes, x, y)
-        words = f"largest {stress[worst]:.4g} MPa at x = {x:.4g} m, y = {y:.4g} m, t = {when:.4g} s"
-        axes.set_title(f"{view.name}:  {words}", loc="left", fontsize=10, parse_math=False)
+            place = _flat(view, view.centroid[worst])
+            axes.plot(*place, "o", mfc="none", mec=BLUE, mew=1.8, ms=13.0, clip_on=False)
+        places = zip("xyz", MILLI * view.centroid[worst])
+        where = ", ".join(f"{name} = {value:.4g}" for name, value in places)
+        words = f"largest {stress[worst]:.4g} MPa at {where} mm, t = {when[worst]:.4g} s"
+        axes.set_title(f"{view.name}:  {words}")
     colour_scale(figure, STRESS, STRESS_COLOURS, marks)
     return figure
 
 
+@styled
 def parts_figure(
     parts: Sequence[Part], title: str, masses: Sequence[float], own: bool = False
 ) -> Figure:
@@ -123,32 +140,32 @@ def parts_figure(
 
     plates = [part for part in parts if isinstance(part, PlanePart)]
     if not plates:
-        from dolfinopt.plots.solid_design import solid_parts_figure
+        from dolfinopt.plots.solid import solid_parts_figure
 
         solids = [part for part in parts if isinstance(part, (SolidPart, HollowPart))]
         return solid_parts_figure(solids, title, masses)
     corners = [MILLI * part.domain.corners for part in plates]
     words = "part" if own else "part over density"
-    figure, rows = _arm_rows(corners, f"{title}: {words}", "mm", LABEL_FOOT if own else FOOT)
+    foot = LABEL_FOOT if own else LABEL_FOOT + SCALE_FOOT
+    figure, rows = _arm_rows([box_of(cells) for cells in corners], f"{title}: {words}", "mm", foot)
     for axes, part, cells, mass in zip(rows, plates, corners, masses, strict=True):
-        loops = _loops(part)
+        loops, shape = _loops(part), part.shape
         if own:
             axes.add_patch(PathPatch(_compound(loops), fc=FACE, ec="none"))
         else:
-            _fill(axes, cells, part.domain.x_phys)
+            fill_cells(axes, cells, part.domain.x_phys)
         for loop in loops:
-            axes.plot(*np.vstack([loop, loop[:1]]).T, color=ORANGE, lw=1.3, clip_on=False)
-        shape = part.shape
-        words = (
+            axes.plot(*np.vstack([loop, loop[:1]]).T, color=ORANGE, clip_on=False)
+        axes.set_title(
             f"{part.name}:  {1e6 * shape.area:.5g} mm\N{SUPERSCRIPT TWO}, {mass:.4g} kg, "
             f"{len(shape.loops) - 1} holes, {len(shape.curves)} curves"
         )
-        axes.set_title(words, loc="left", fontsize=10, parse_math=False)
     if not own:
         colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))
     return figure
 
 
+@styled
 def figure_of_plates(parts: Sequence[PlanePart], densities: Sequence[float] = ()) -> Figure:
     """Return a picture of parts as plates seen from the right and above, to one scale.
 
@@ -156,17 +173,17 @@ def figure_of_plates(parts: Sequence[PlanePart], densities: Sequence[float] = ()
         parts: below each other.
         densities: of their material, kg/m3: captions then tell the masses.
     """
-    corners = [MILLI * part.domain.corners for part in parts]
-    figure, rows = _arm_rows(corners, "", "mm", 0.2, PLATE)
+    boxes = [box_of(MILLI * part.domain.corners) for part in parts]
+    figure, rows = _arm_rows(boxes, "", "mm", 0.2, PLATE)
     for k, (axes, part) in enumerate(zip(rows, parts, strict=True)):
         loops, thickness = _loops(part), part.domain.thickness
         _draw_plate(axes, loops, MILLI * thickness * DEPTH)
         size = [*np.ptp(loops[0], axis=0), MILLI * thickness]
-        words = " \N{MULTIPLICATION SIGN} ".join(f"{one:.4g}" for one in size) + " mm"
+        words = " \N{MULTIPLICATION SIGN} ".join(f"{length:.4g}" for length in size) + " mm"
         if len(densities):
             words += f", {densities[k] * part.shape.area * thickness:.3g} kg"
         words += f", {len(loops) - 1} holes, {len(part.shape.curves)} curves"
-        axes.set_title(f"{part.domain.name}:  {words}", loc="left", fontsize=11, parse_math=False)
+        axes.set_title(f"{part.domain.name}:  {words}")
         axes.set_axis_off()
     return figure
 
@@ -176,9 +193,14 @@ def is_solid(views: Sequence[ArmView]) -> bool:
     return bool(views[0].corners.shape[2] == 3)
 
 
-def draw_ring(axes: Axes, x: float, y: float) -> None:
-    """Mark the place of the largest stress."""
-    axes.plot(x, y, "o", mfc="none", mec=BLUE, mew=1.8, ms=13.0, clip_on=False)
+def box_of(corners: np.ndarray) -> Box:
+    """Return the lowest and highest corner of cells (n, k, d)."""
+    return corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+
+
+def bounds(view: ArmView) -> Box:
+    """Return the box of an arm, m."""
+    return box_of(view.corners)
 
 
 def scale_marks(largest: float) -> np.ndarray:
@@ -189,20 +211,50 @@ def scale_marks(largest: float) -> np.ndarray:
     return step * np.arange(int(np.ceil(largest / step - 1e-9)) + 1)
 
 
-def known_stress(view: ArmView) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest stress of every cell, Pa, and its instant, s, of a view that has them."""
-    assert view.stress is not None and view.stress_instant is not None
-    return view.stress, view.stress_instant
+# -- one arm in its axes ---------------------------------------------------------------------
+
+
+def _panels(views: Sequence[ArmView], title: str, scaled: bool) -> tuple[Figure, list[Axes]]:
+    """Return a figure with axes for each arm, m, and room for a scale of colours if wanted."""
+    foot, boxes = SCALE_FOOT if scaled else 0.0, [bounds(view) for view in views]
+    if not is_solid(views):
+        return _arm_rows(boxes, title, "m", LABEL_FOOT + foot)
+    from dolfinopt.plots.solid import box_rows
+
+    return box_rows(boxes, title, foot)
+
+
+def _draw_arm(
+    axes: Axes, view: ArmView, values: np.ndarray | None, colours: str, largest: float
+) -> None:
+    """Draw an arm in the colours of its cells' values from 0 to `largest`; None: of material."""
+    if is_solid([view]):
+        from dolfinopt.plots.solid import draw_link
+
+        draw_link(axes, view, values, colours, largest)
+        return
+    assert values is not None
+    fill_cells(axes, view.corners, values, colours, largest)
+    rim: Any = sides(view.corners)[boundary(view.corners)]
+    axes.add_collection(LineCollection(rim, colors=GREY, linewidths=1.0), autolim=False)
+
+
+def _flat(view: ArmView, point: np.ndarray) -> np.ndarray:
+    """Return where a point of an arm (d,), m, is in its axes."""
+    if not is_solid([view]):
+        return point
+    from dolfinopt.plots.solid import LINKS
+
+    return LINKS.plane(point)
 
 
 def _arm_rows(
-    corners: Sequence[np.ndarray], title: str, unit: str, foot: float, least: float = LOW
+    boxes: Sequence[Box], title: str, unit: str, foot: float, least: float = LOW
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure with axes for each arm, inboard joints in one column."""
-    boxes: list[Box] = [(one.min(axis=(0, 1)), one.max(axis=(0, 1))) for one in corners]
+    """Return a figure with axes for each plane arm, inboard joints in one column."""
     margin = MARGIN * max(float((high - low)[0]) for low, high in boxes)
-    boxes = [(low - margin, high + margin) for low, high in boxes]
-    figure, rows = stacked_axes(boxes, title, below=0.12, foot=foot, least=least)
+    wider = [(low - margin, high + margin) for low, high in boxes]
+    figure, rows = stacked_axes(wider, title, below=0.12, foot=foot, least=least)
     for axes in rows:
         axes.set_ylabel(f"y [{unit}]")
         axes.locator_params(axis="x", nbins=max(2, int(axes.bbox.width / 90.0)))
@@ -213,30 +265,27 @@ def _arm_rows(
     return figure, rows
 
 
-def _fill(
+def fill_cells(
     axes: Axes,
     corners: np.ndarray,
     values: np.ndarray,
     colours: str = COLOURS,
     largest: float = 1.0,
+    **look: Any,
 ) -> None:
-    """Draw cells in the colours of their values from 0 to `largest`."""
+    """Draw cells (n, k, 2) in the colours of their values from 0 to `largest`."""
     polygons: Any = corners  # as one array: a list would become a path a cell in Python
     # Blended edges would let the ground shine through between neighbours.
-    cells = PolyCollection(polygons, cmap=colours, antialiaseds=False, lw=0.0, rasterized=True)
+    cells = PolyCollection(
+        polygons, cmap=colours, antialiaseds=False, lw=0.0, rasterized=True, **look
+    )
     cells.set_array(values)
     cells.set_clim(0.0, largest)
     axes.add_collection(cells, autolim=False)
 
 
-def _draw_rim(axes: Axes, corners: np.ndarray) -> None:
-    """Draw the outline of cells."""
-    rim: Any = sides(corners)[boundary(corners)]
-    axes.add_collection(LineCollection(rim, colors=GREY, linewidths=1.0), autolim=False)
-
-
 def _caption(view: ArmView) -> str:
-    """Return what stands above an arm: from joint axis to joint axis, height, material."""
+    """Return what stands above a plane arm: from joint axis to joint axis, height, material."""
     size = np.ptp(view.corners, axis=(0, 1))
     long = f"{size[0]:.4g} m long"
     if view.length is not None:
@@ -271,16 +320,11 @@ def _compound(loops: Sequence[np.ndarray]) -> Path:
 # -- polygons: areas and outlines -------------------------------------------------------------
 
 
-def cell_areas(corners: np.ndarray) -> np.ndarray:
-    """Return the areas (n,), m2, of polygons with corners (n, k, 2), m, in order around each."""
-    x, y = corners[..., 0], corners[..., 1]
-    after_x, after_y = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
-    return 0.5 * np.abs(np.sum(x * after_y - after_x * y, axis=1))
-
-
 def volume_fraction(view: ArmView) -> float:
-    """Return the mean physical density of an arm, weighted with its cells' areas."""
-    area = cell_areas(view.corners)
+    """Return the mean physical density of a plane arm, weighted with its cells' areas."""
+    x, y = view.corners[..., 0], view.corners[..., 1]
+    crossed = x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y
+    area = np.abs(crossed.sum(axis=1))
     return float(area @ view.density / area.sum())
 
 

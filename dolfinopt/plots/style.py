@@ -7,9 +7,10 @@ Matplotlib is imported where it is used: most commands draw nothing.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -27,7 +28,6 @@ PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#5
 # that of curves which coincide the lower one shows through the gaps of the upper one.
 DASHES: tuple[Any, ...] = ("-", (0, (5, 2)), (0, (1.2, 1.4)), (0, (6, 1.6, 1.2, 1.6)))
 MARKERS = "osD^vPX"
-LINE_WIDTH, MARKER_SIZE = 1.6, 5.0  # points
 BLUE, ORANGE, GREY = PALETTE[0], PALETTE[1], "#6e6e6e"
 INITIAL, OPTIMISED = "initial design", "optimised design"
 KNOWN = {OPTIMISED: 0, INITIAL: 1}  # the same in all pictures of all runs
@@ -77,8 +77,6 @@ def look(number: int) -> dict[str, Any]:
         "color": PALETTE[number % len(PALETTE)],
         "linestyle": DASHES[number % len(DASHES)],
         "marker": MARKERS[number % len(MARKERS)],
-        "markersize": MARKER_SIZE,
-        "linewidth": LINE_WIDTH,
         "zorder": 2.0 + 0.1 * (number % len(DASHES)),  # what has gaps lies above what has none
     }
 
@@ -123,8 +121,8 @@ def spans_decade(values: np.ndarray) -> bool:
 
 
 def log_scale(axes: Axes, values: np.ndarray) -> None:
-    """Make y logarithmic for positive values, labelled with plain numbers or powers of ten."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+    """Make y logarithmic for positive values, labelled with plain numbers."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     axes.set_yscale("log")
     ratio = float(np.max(values)) / float(np.min(values))
@@ -132,20 +130,17 @@ def log_scale(axes: Axes, values: np.ndarray) -> None:
     subs = [1.0, 2.0, 5.0] if ratio < 50.0 else [1.0]
     short = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
     axes.yaxis.set_major_locator(short if ratio < 5.0 else LogLocator(subs=subs))
-    if ratio < 1e4:
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def log2_scale(axes: Axes) -> None:
     """Make x logarithmic with powers of two in full: numbers that are doubled, not added to."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+    from matplotlib.ticker import NullLocator
 
     axes.set_xscale("log", base=2)
-    axes.xaxis.set_major_locator(LogLocator(base=2.0))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_locator(NullLocator())
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def round_number(value: float) -> float:
@@ -162,6 +157,14 @@ def ticks(low: float, high: float, count: int = 10) -> np.ndarray:
     return step * np.arange(int(first), int(last) + 1)  # of integers: there is no -0
 
 
+def mixed(colour: str, strength: float) -> str:
+    """Return a share `strength` of a colour, the rest white."""
+    from matplotlib.colors import to_hex, to_rgb
+
+    red, green, blue = (1.0 - strength * (1.0 - part) for part in to_rgb(colour))
+    return to_hex((red, green, blue))
+
+
 def decimals(t: np.ndarray) -> int:
     """Return how many decimals tell the instants (n,), s, of a motion of that length: 2 or more."""
     span = float(np.ptp(t))
@@ -170,33 +173,85 @@ def decimals(t: np.ndarray) -> int:
 
 # -- figures and files -----------------------------------------------------------------------
 
+# What all figures share, in Matplotlib's own words; words are text, no formulas.
 DPI = 110  # px per inch
+STYLE: dict[str, Any] = {
+    "figure.dpi": DPI,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10,
+    "axes.titley": 1.0,
+    "legend.fontsize": 9,
+    "legend.frameon": False,
+    "lines.linewidth": 1.6,
+    "lines.markersize": 5.0,
+    "text.parse_math": False,
+}
+TITLE = 12  # points, of what stands above a whole figure
 WIDTH, HEIGHT, NARROW = 13.0, 16.0, 8.0  # inches: the most that stacked axes take, the least width
-LEFT, RIGHT, HEAD = 0.85, 0.5, 0.5  # inches beside and above stacked axes
+LEFT, RIGHT, HEAD = 0.85, 0.5, 0.5  # inches beside and above axes, for labels and the title
+FRAME, FOOT = np.array([7.5, 7.0]), 0.85  # inches, of axes alone, and below them
+
+Drawing = TypeVar("Drawing", bound=Callable[..., Any])
 
 
-def new_figure(width: float, height: float, dpi: int = DPI, *, laid_out: bool = True) -> Figure:
+def styled(draw: Drawing) -> Drawing:
+    """Let a function that makes a figure draw in `STYLE`."""
+
+    @wraps(draw)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        from matplotlib import rc_context
+
+        with rc_context(STYLE):
+            return draw(*args, **kwargs)
+
+    return wrapped  # type: ignore[return-value]
+
+
+def new_figure(width: float, height: float, *, laid_out: bool = False) -> Figure:
     """Return an empty figure, inches, that no global state knows of.
 
     Args:
         width, height: inches.
-        dpi: px per inch.
         laid_out: let Matplotlib place the axes.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), dpi=dpi)
+    figure = Figure(figsize=(width, height), dpi=DPI)
     if laid_out:
         figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
     FigureCanvasAgg(figure)
     return figure
 
 
-def cut_to(title: str, inches: float) -> str:
-    """Return as much of a title as fits into a width."""
-    most = int(8.0 * inches)  # letters of a bold title
-    return title if len(title) <= most else title[: max(0, most - 3)] + "..."
+def headline(figure: Figure, title: str, left: float = LEFT) -> None:
+    """Write as much of a title above a figure as fits; `left` of it, inches."""
+    width, height = figure.get_size_inches()
+    most = int(8.0 * (width - left))  # letters
+    words = title if len(title) <= most else title[: max(0, most - 3)] + "..."
+    figure.text(left / width, 1.0 - 0.12 / height, words, va="top", fontsize=TITLE, weight="bold")
+
+
+def framed_axes(
+    low: np.ndarray, high: np.ndarray, title: str, sides: tuple[float, float]
+) -> tuple[Figure, Axes, float]:
+    """Return a figure, its axes for a part of the plane, of equal scales, and inches per metre.
+
+    Args:
+        low, high: corners (2,) of the part, m.
+        title: above it.
+        sides: least room left and right, inches.
+    """
+    span = high - low
+    scale = float(np.min(FRAME / span))
+    wide, tall = scale * span
+    width, height = max(NARROW - 1.0, wide + sum(sides)), tall + 1.5 * HEAD + FOOT
+    figure = new_figure(width, height)
+    headline(figure, title, sides[0])
+    left = sides[0] + 0.5 * (width - wide - sum(sides))
+    axes = figure.add_axes((left / width, FOOT / height, wide / width, tall / height))
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), autoscale_on=False)
+    return figure, axes, scale
 
 
 def stacked_axes(
@@ -224,9 +279,8 @@ def stacked_axes(
     heights, wide = np.maximum(scale * tall, least), scale * (right - left)
     width, head = max(NARROW, wide + LEFT + RIGHT), HEAD if title else 0.0
     height = head + foot + float((heights + above + below).sum())
-    figure = new_figure(width, height, laid_out=False)
-    figure.text(LEFT / width, 1.0 - 0.15 / height, cut_to(title, width - LEFT), va="top",
-                fontsize=13, weight="bold", parse_math=False)  # fmt: skip
+    figure = new_figure(width, height)
+    headline(figure, title)
     rows, top = [], height - head
     for middle, inches in zip(0.5 * (lows + highs)[:, 1], heights, strict=True):
         top -= above + inches

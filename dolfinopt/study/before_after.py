@@ -144,15 +144,17 @@ def before_after_page(
 
     `sections` are straight members beside the run after, see `sections.sections_of`.
     """
-    from dolfinopt.plots.solid_machine import solid_machine_figure
+    from dolfinopt.plots.machine import poses_figure
+    from dolfinopt.plots.poses import body_poses
 
     sides, rows = {BEFORE: before, AFTER: after}, table.frame
     on_top = rows["figure"].str.startswith(("mass of", "largest tool", "first frequency"))
     on_top &= (rows["figure"] != "mass of all arms") & rows[[BEFORE, AFTER]].notna().all(axis=1)
     machines = []
     for label, side in sides.items():
-        drawn = solid_machine_figure(side.views, side.mechanism, side.t, side.q_r, label)
-        machines.append((label, _embedded(drawn)))
+        still = np.zeros((len(side.t), side.mechanism.num_coordinates))
+        poses = body_poses(side.mechanism, side.q_r, still)
+        machines.append((label, _embedded(poses_figure(side.views, poses, side.t, label))))
     return html_page(
         "before_after.html",
         title=table.title,
@@ -173,13 +175,13 @@ def before_after_page(
 
 def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
     """Yield every link that one of the runs designs, by its name: both to one scale."""
-    from dolfinopt.plots.solid_design import solid_design_figure
+    from dolfinopt.plots.design import design_figure
 
     found = [(label, view) for label, side in sides.items() for view in designed(side.views)]
     for name in dict.fromkeys(view.name for _, view in found):
         views = [replace(view, name=label) for label, view in found if view.name == name]
         masses = {view.name: sides[view.name].summary["mass"][name] for view in views}
-        yield name, _embedded(solid_design_figure(views, name, masses))
+        yield name, _embedded(design_figure(views, name, masses))
 
 
 def _curves(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:

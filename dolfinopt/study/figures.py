@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
-LEGEND: dict[str, Any] = {"loc": "upper left", "frameon": False, "fontsize": 9, "handlelength": 5.0}
+LEGEND: dict[str, Any] = {"loc": "upper left", "handlelength": 5.0}
 
 Looks = Mapping[str, Mapping[str, Any]]
 
@@ -64,27 +64,29 @@ def _grid(
     title: str, rows: int, columns: int, width: float, height: float
 ) -> tuple[Figure, np.ndarray]:
     """Return a figure with its title, and axes (rows, columns), inches each."""
-    drawn = style.new_figure(width * columns + 0.6, height * rows + 0.6)
-    drawn.suptitle(title, x=0.01, ha="left", fontsize=12, parse_math=False)
+    drawn = style.new_figure(width * columns + 0.6, height * rows + 0.6, laid_out=True)
+    drawn.suptitle(title, x=0.01, ha="left", fontsize=style.TITLE)
     return drawn, drawn.subplots(rows, columns, squeeze=False)
 
 
 def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> None:
-    """Write what axes show; formulas are text."""
-    axes.set_title(title, loc="left", fontsize=10, parse_math=False)
-    axes.set_xlabel(x_label, parse_math=False)
-    axes.set_ylabel(y_label, parse_math=False)
+    """Write what axes show."""
+    axes.set_title(title)
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
 
 
 # -- curves ----------------------------------------------------------------------------------
 
 
+@style.styled
 def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
     """Return the panels below each other, flush, each with its legend: legible on a phone."""
     panels = figure.panels
     styles = styles or common_looks([figure])
     heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
-    drawn = style.new_figure(5.4, sum(heights), 160)
+    drawn = style.new_figure(5.4, sum(heights), laid_out=True)
+    drawn.set_dpi(160)  # px per inch
     grid = drawn.subplots(len(panels), 1, squeeze=False, height_ratios=[1.0] * len(panels))[:, 0]
     for axes, panel in zip(grid, panels, strict=True):
         _draw_panel(axes, panel, styles)
@@ -125,6 +127,7 @@ def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
 # -- tables and samples ------------------------------------------------------------------------
 
 
+@style.styled
 def matrix_figure(figure: FrameFigure) -> Figure:
     """Return heat maps with their numbers: design i in scenario j.
 
@@ -150,6 +153,7 @@ def matrix_figure(figure: FrameFigure) -> Figure:
     return drawn
 
 
+@style.styled
 def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
     """Return histograms, the share of the samples below as a curve, and the nominal values.
 
@@ -170,7 +174,7 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             share = axes.twinx()
             share.step(np.sort(values), np.arange(1, len(values) + 1) / len(values), where="post",
-                       color=GREY, linewidth=1.4)  # fmt: skip
+                       color=GREY)  # fmt: skip
             share.set_ylim(0.0, 1.0)
             share.set_ylabel("share of samples below [-]", color=GREY)
     return drawn
@@ -179,12 +183,13 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
 # -- designs ---------------------------------------------------------------------------------
 
 
+@style.styled
 def design_figure(figure: tables.DesignFigure) -> Figure:
     """Return the designs below each other, to one scale."""
     views = [designed(read_views(scene, path)) for _, scene, path in figure.designs]
     labels = [label for label, _, _ in figure.designs]
     if figure.designs[0][1].dimension == 3:  # PyVista is imported where solids are drawn
-        from dolfinopt.plots.solid_design import solid_designs_figure
+        from dolfinopt.plots.solid import solid_designs_figure
 
         return solid_designs_figure(labels, views, figure.title)
     from dolfinopt.plots import design
@@ -196,5 +201,5 @@ def design_figure(figure: tables.DesignFigure) -> Figure:
     ]
     drawn = design.design_figure(every, figure.title)
     for axes, view in zip(drawn.axes, every):  # all arms have one size
-        axes.set_title(view.name, loc="left", fontsize=10, parse_math=False)
+        axes.set_title(view.name)
     return drawn

@@ -124,17 +124,17 @@ def drawn(monkeypatch):
     """What the page has drawn of machines and links, by small pictures in their place."""
     titles = []
 
-    def machine(views, mechanism, t, q_r, title):
-        assert len(views) == len(mechanism.bodies) and len(t) == len(q_r)
+    def machine(views, poses, t, title):
+        assert len(views) == len(poses.mechanism.bodies) and len(t) == len(poses.end)
         titles.append(title)
-        return new_figure(1.0, 1.0, 20)
+        return new_figure(1.0, 1.0)
 
     def links(views, title, masses):
         titles.append((title, [view.name for view in views], list(masses)))
-        return new_figure(1.0, 1.0, 20)
+        return new_figure(1.0, 1.0)
 
-    monkeypatch.setattr("dolfinopt.plots.solid_machine.solid_machine_figure", machine)
-    monkeypatch.setattr("dolfinopt.plots.solid_design.solid_design_figure", links)
+    monkeypatch.setattr("dolfinopt.plots.machine.poses_figure", machine)
+    monkeypatch.setattr("dolfinopt.plots.design.design_figure", links)
     return titles
 
 

@@ -12,11 +12,12 @@ import dolfinopt as do
 from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.multibody.kinematics import end_effector
+from dolfinopt.multibody.shape_integrals import linear_part
 from dolfinopt.output.design import ArmView, designed
 from dolfinopt.part.solid.surface import surface_at
-from dolfinopt.plots import animation, solid_design, solid_machine
+from dolfinopt.plots import machine, solid
 from dolfinopt.plots.design import design_figure, stress_figure
-from dolfinopt.plots.solid_machine import body_frames
+from dolfinopt.plots.poses import body_poses
 
 pytestmark = pytest.mark.serial
 CELLS, SIZE = (20, 4, 2), np.array([0.5, 0.1, 0.05])
@@ -39,12 +40,12 @@ def test_projected_area_of_a_link():
 
     def drawn(view):
         low, high = np.array([-0.1, -0.3]), np.array([0.6, 0.3])
-        studio = solid_design.Studio(solid_design.LINKS, low, high, 1000.0)
-        studio.solid(solid_design.material(view), color=solid_design.STEEL)
+        studio = solid.Studio(solid.LINKS, low, high, 1000.0)
+        studio.solid(solid.material(view), color=solid.STEEL)
         return float((studio.close() < 250).any(axis=-1).sum()) / 1000.0**2
 
     def expected(x, y, z):
-        return float(np.abs(solid_design.LINKS.back) @ [y * z, x * z, x * y])
+        return float(np.abs(solid.LINKS.back) @ [y * z, x * z, x * y])
 
     assert drawn(link(lambda x: np.ones(len(x)))) == pytest.approx(expected(*SIZE), rel=0.01)
     half = link(lambda x: (x[:, 0] < 0.25).astype(float))
@@ -60,24 +61,24 @@ def test_picture_of_a_link():
     (axes,) = figure.axes
     words = axes.get_title(loc="left")
     assert words == "link:  500 x 100 x 50 mm, volume 1500 cm3 (60 %), mass 1.25 kg"
-    assert "no density above 0.5" in solid_design.caption(link(lambda x: 0.0 * x[:, 0]), None)
+    assert "no density above 0.5" in solid.caption(link(lambda x: 0.0 * x[:, 0]), None)
     lengths = [text for text in axes.texts if text.get_text()[:1].isdigit()]
     marks = [text.get_text() for text in lengths]
     assert marks == [*(f"{mark}" for mark in range(0, 500, 50)), "500 mm"]
     places = np.array([text.get_position() for text in lengths])
-    edge = solid_design.LINKS.plane(np.array([[0.0, -0.05, 0.025], [0.5, -0.05, 0.025]]))
+    edge = solid.LINKS.plane(np.array([[0.0, -0.05, 0.025], [0.5, -0.05, 0.025]]))
     np.testing.assert_allclose(places[[0, -1], 0], edge[:, 0], atol=1e-12)
     assert (places[:, 1] < np.linspace(*edge[:, 1], 11)).all()
     box = figure.get_tightbbox()
     assert box.x0 >= 0.0 and box.x1 <= figure.get_figwidth()
-    several = solid_design.solid_designs_figure(["a", "b"], [[view], [view, view]], "two")
+    several = solid.solid_designs_figure(["a", "b"], [[view], [view, view]], "two")
     assert sum(bool(axes.images) for axes in several.axes) == 3
 
 
 def test_surface_carries_fields_and_cells():
     """Fields that are linear in space stay so on the surface; every triangle knows its cell."""
     view = link(lambda x: 1.2 * (1.0 - x[:, 0] / SIZE[0]))
-    surface = solid_design.material(view, modes=True)
+    surface = solid.material(view, modes=True)
     points = surface.points
     assert surface.fields["modes"] == pytest.approx(points[..., None] * [1.0, 2.0], abs=1e-6)
     middle = surface.corners.mean(axis=1)
@@ -98,41 +99,44 @@ def result():
     return model.simulate(stress=True)
 
 
-def test_frames_lead_to_the_end_effector(result):
+def test_poses_lead_to_the_end_effector(result):
     one = result.trajectory
-    frames = body_frames(one.mechanism, one.q_r, one.q_e)
-    end = end_effector(one.mechanism, one.motion, one.q_e)
+    poses = body_poses(one.mechanism, one.q_r, one.q_e)
+    bodies = tuple(map(linear_part, one.mechanism.bodies))
+    end = end_effector(replace(one.mechanism, bodies=bodies), one.motion, one.q_e)
     assert np.abs(one.q_e).max() > 0.01  # it bends
-    assert frames.outboard[:, one.mechanism.end[0]] == pytest.approx(end, abs=1e-14)
-    assert frames.axes[:, 0] == pytest.approx(np.tile([0.0, 0.0, 1.0], (len(end), 1)))
+    assert poses.end == pytest.approx(end, abs=1e-14)
+    assert poses.outboard[:, one.mechanism.end[0]] == pytest.approx(end, abs=1e-14)
     # The shoulder's axis is horizontal and turns with the yaw.
-    yaw = one.q_r[:, 0]
+    yaw, axis = one.q_r[:, 0], one.mechanism.joints[1].axis
     flat = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=1)
-    assert frames.axes[:, 1] == pytest.approx(flat, abs=1e-14)
+    assert poses.rotation[:, 1] @ axis == pytest.approx(flat, abs=1e-14)
 
 
 def test_picture_of_a_machine_in_space(result):
-    """The payload of every pose is where its instant says, the links lead there."""
+    """The payload of a pose is where its instant says, the links lead there."""
     one = result.trajectory
-    machine = solid_machine.assemble(result.views, one.mechanism)
-    frames = body_frames(one.mechanism, one.q_r, np.zeros_like(one.q_e))
-    camera = solid_machine.camera_of(machine, frames)
-    low, high = solid_machine.seen_part(machine, frames, camera)
-    studio = solid_design.Studio(camera, low, high, 300.0)
-    solid_machine.draw_pose(studio, machine, frames, len(one.t) - 1, 0, 0.0)
-    image = studio.close().astype(int)
+    poses = body_poses(one.mechanism, one.q_r, np.zeros_like(one.q_e))
+    stage = machine.stage(result.views, poses, [], "title")
+    try:
+        stage.pose(len(one.t) - 1)
+        stage.render()
+    finally:
+        stage.close()
+    image = np.asarray(stage.axes.images[0].get_array()).astype(int)
+    left, right, low, _ = stage.axes.images[0].get_extent()
 
     def colour_at(point):
-        x, y = (camera.plane(point) - low) * 300.0
-        return image[image.shape[0] - 1 - round(y), round(x)]
+        x, y = stage.flat(point)
+        px = image.shape[1] / (right - left)
+        return image[image.shape[0] - 1 - round((y - low) * px), round((x - left) * px)]
 
-    red, _, blue = colour_at(frames.outboard[-1, one.mechanism.end[0]])
+    red, _, blue = colour_at(poses.end[-1])
     assert red > 2 * blue  # orange
     for k in (1, 2):
-        red, _, blue = colour_at(0.5 * (frames.origin[-1, k] + frames.outboard[-1, k]))
+        red, _, blue = colour_at(0.5 * (poses.origin[-1, k] + poses.outboard[-1, k]))
         assert blue > red  # steel
-    left = frames.outboard[0, one.mechanism.end[0]]
-    assert (colour_at(left) > 250).all()  # nothing is there
+    assert (colour_at(poses.end[0]) > 250).all()  # nothing is there
 
 
 def test_figures_of_a_model_in_space(result):
@@ -161,34 +165,30 @@ def test_colours_of_stress():
     extent = panel.images[0].get_extent()
 
     def colour_at(point):
-        x, y = solid_design.LINKS.plane(np.array(point)) - [extent[0], extent[2]]
+        x, y = solid.LINKS.plane(np.array(point)) - [extent[0], extent[2]]
         size = image.shape[1] / (extent[1] - extent[0])
         return image[image.shape[0] - 1 - round(y * size), round(x * size)]
 
     calm, strained = colour_at([0.2, 0.0, 0.025]), colour_at([0.4, 0.0, 0.025])
     assert calm[1] > 200 > 60 > strained[1]  # light yellow, dark red
     (ring,) = [line.get_xydata() for line in panel.lines if line.get_marker() == "o"]
-    np.testing.assert_allclose(ring, solid_design.LINKS.plane(view.centroid[7:8]))
+    np.testing.assert_allclose(ring, solid.LINKS.plane(view.centroid[7:8]))
 
 
 def test_film_in_space(result, tmp_path):
     """Surfaces end at the interfaces of the magnified machine; every frame is another picture."""
     one = result.trajectory
-    film = solid_machine.make_solid_film(result.views, one, magnification=2.0, frames=4)
-    stage = solid_machine.SolidStage(film, 0.1)
-    try:
-        for i in (1, 2):
-            points = stage.rest[i][0]
-            outer = points[:, 0] > points[:, 0].max() - 1e-6
-            for n in range(4):
-                end = stage.surface_points(i, n)[outer]
-                middle = 0.5 * (end.min(axis=0) + end.max(axis=0))
-                assert middle == pytest.approx(film.frames.outboard[n, i], abs=2e-3)
-    finally:
-        stage.close()
+    film = machine.make_film(one, magnification=2.0, frames=4)
+    for i in (1, 2):
+        surface = solid.material(result.views[i], modes=True)
+        outer = surface.points[:, 0] > surface.points[:, 0].max() - 1e-6
+        for n in range(4):
+            points = film.bent.material(surface.points, surface.fields["modes"], i, n)[outer]
+            middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+            assert middle == pytest.approx(film.bent.outboard[n, i], abs=2e-3)
     bent = film.trace - film.desired
     assert np.abs(bent - 2.0 * one.deviation).max() < 0.1 * np.abs(bent).max()
-    path = animation.draw_motion(tmp_path / "motion.gif", result.views, one, frames=4)
+    path = machine.draw_motion(tmp_path / "motion.gif", result.views, one, frames=4)
     with Image.open(path) as found:
         assert found.n_frames == 4
         images = []

@@ -6,7 +6,7 @@ whose coordinates are the plane of projection, m, and writes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,22 +17,17 @@ from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import ArmView
 from dolfinopt.part.solid.surface import Surface, surface_at
-from dolfinopt.plots.design import (
-    MEGA,
-    STRESS,
-    STRESS_COLOURS,
-    draw_ring,
-    known_stress,
-    scale_marks,
-)
+from dolfinopt.plots.design import bounds
+from dolfinopt.plots.poses import box_corners
 from dolfinopt.plots.style import (
     DPI,
     GREY,
     MILLI,
+    TITLE,
     Box,
-    colour_scale,
     new_figure,
     stacked_axes,
+    styled,
     ticks,
 )
 
@@ -43,7 +38,6 @@ if TYPE_CHECKING:
     from dolfinopt.part.hollow import HollowPart
     from dolfinopt.part.solid.part import SolidPart
 
-WALL_COLOURS = "viridis_r"
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
 Colour = str | tuple[float, float, float]
@@ -126,9 +120,9 @@ class Studio:
 
     def line(self, points: np.ndarray, colour: Colour, width: float = 1.0) -> None:
         """Draw line segments (n, 2, 3), m; `width` px."""
-        ends = np.asarray(points, dtype=float).reshape(-1, 3)
-        mesh = pyvista.line_segments_from_points(ends)
-        self.plotter.add_mesh(mesh, color=colour, line_width=width, lighting=False, **PLAIN)
+        if len(points):
+            mesh = pyvista.line_segments_from_points(points.reshape(-1, 3))
+            self.plotter.add_mesh(mesh, color=colour, line_width=width, lighting=False, **PLAIN)
 
     def bar(self, ends: np.ndarray, radius: float, colour: Colour = BAR) -> None:
         """Draw a round bar between two points (2, 3), m; nothing where they coincide."""
@@ -179,12 +173,6 @@ def material(view: ArmView, *, modes: bool = False) -> Surface:
     return surface_at(view.corners[:, order], view.solid, LEVEL, fields)
 
 
-def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Return the corners (8, 3) of a box, x fastest."""
-    grid = np.meshgrid(*np.stack([low, high], axis=1), indexing="ij")
-    return np.stack([axis.ravel(order="F") for axis in grid], axis=1)
-
-
 def draw_triad(axes: Axes, camera: Camera, at: np.ndarray, length: float) -> None:
     """Draw the directions of x, y and z at a place (2,) of the plane, m."""
     for name, along in zip("xyz", np.eye(3)):
@@ -198,28 +186,7 @@ def draw_triad(axes: Axes, camera: Camera, at: np.ndarray, length: float) -> Non
         axes.text(x, y, name, ha="center", va="center", fontsize=9)
 
 
-def solid_design_figure(
-    views: Sequence[ArmView], title: str, masses: Mapping[str, float] | None = None
-) -> Figure:
-    """Return the picture of the material of solid links; arguments as for `design_figure`."""
-    thickest = max((MILLI * float(v.wall.max()) for v in views if v.wall is not None), default=0.0)
-    foot = 0.75 if thickest else 0.0
-    figure, panels = _box_axes([_bounds(view) for view in views], title, foot)
-    marks = scale_marks(thickest)
-    for view, axes in zip(views, panels, strict=True):
-        surface = material(view)
-        look: dict[str, Any] = {}
-        if view.wall is not None:
-            wall = MILLI * view.wall[surface.cells]
-            look = {"scalars": wall, "cmap": WALL_COLOURS, "clim": (0.0, marks[-1])}
-        _draw_boxed(axes, _bounds(view), surface, **look)
-        mass = None if masses is None else masses.get(view.name)
-        axes.set_title(caption(view, mass), loc="left", fontsize=10, parse_math=False)
-    if thickest:
-        colour_scale(figure, "thickness of the wall (mm)", WALL_COLOURS, marks)
-    return figure
-
-
+@styled
 def solid_designs_figure(
     labels: Sequence[str], rows: Sequence[Sequence[ArmView]], title: str
 ) -> Figure:
@@ -231,55 +198,26 @@ def solid_designs_figure(
         title: above the picture.
     """
     columns = max(map(len, rows))
-    spans = np.array([np.subtract(*_seen(_bounds(v))[::-1]) for row in rows for v in row])
+    spans = np.array([np.subtract(*_seen(bounds(v))[::-1]) for row in rows for v in row])
     wide, tall = spans.max(axis=0)
     height = len(rows) * (tall / wide * COLUMN + 0.5) + 0.6
-    figure = new_figure(COLUMN * columns + 0.4, height)
+    figure = new_figure(COLUMN * columns + 0.4, height, laid_out=True)
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for axes, row, label in zip(grid, rows, labels, strict=True):
         for one in axes:
             one.set(xlim=(0.0, wide), ylim=(0.0, tall), aspect="equal")
             one.set_axis_off()
         for one, view in zip(axes, row):
-            low, high = _seen(_bounds(view))
+            low, high = _seen(bounds(view))
             studio = Studio(LINKS, low, high, COLUMN * DPI / wide)
             studio.solid(material(view), color=STEEL)
-            _draw_edges(studio, _bounds(view))
+            _draw_edges(studio, bounds(view))
             studio.low, studio.high = low - low, high - low
             studio.show(one, studio.close())
             one.set(xlim=(0.0, wide), ylim=(0.0, tall))
-            one.set_title(view.name, loc="right", fontsize=9, color=GREY)
-        axes[0].set_title(label, loc="left", fontsize=10, parse_math=False)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=12, parse_math=False)
-    return figure
-
-
-def solid_stress_figure(views: Sequence[ArmView], title: str) -> Figure:
-    """Return the picture of the largest stress on the surface of solid links, MPa.
-
-    Drawn is what is denser than one half; the place of the largest stress of all is ringed, on
-    whichever side it is. Arguments as for `stress_figure`.
-    """
-    figure, panels = _box_axes([_bounds(view) for view in views], title, 0.75)
-    stresses = [MEGA * known_stress(view)[0] for view in views]
-    largest = max(float(stress.max()) for stress in stresses)
-    marks = scale_marks(largest)
-    for view, axes, stress in zip(views, panels, stresses, strict=True):
-        surface = material(view)
-        look: Any = {
-            "scalars": stress[surface.cells],
-            "cmap": STRESS_COLOURS,
-            "clim": (0.0, marks[-1]),
-        }
-        _draw_boxed(axes, _bounds(view), surface, **look)
-        worst = int(np.argmax(stress))
-        if stress[worst] == largest > 0.0:
-            draw_ring(axes, *LINKS.plane(view.centroid[worst]))
-        (x, y, z), when = MILLI * view.centroid[worst], known_stress(view)[1][worst]
-        words = f"{stress[worst]:.4g} MPa at x = {x:.4g}, y = {y:.4g}, z = {z:.4g} mm"
-        words = f"{view.name}:  largest {words}, t = {when:.4g} s"
-        axes.set_title(words, loc="left", fontsize=10, parse_math=False)
-    colour_scale(figure, STRESS, STRESS_COLOURS, marks)
+            one.set_title(view.name, loc="right", color=GREY)
+        axes[0].set_title(label)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=TITLE)
     return figure
 
 
@@ -294,13 +232,13 @@ def solid_parts_figure(
         masses: of the parts, kg.
     """
     boxes = [(one.surface.points.min(axis=0), one.surface.points.max(axis=0)) for one in parts]
-    figure, panels = _box_axes(boxes, title)
+    figure, panels = box_rows(boxes, title)
     for part, box, axes, mass in zip(parts, boxes, panels, masses, strict=True):
-        _draw_boxed(axes, box, part.surface, edges=False)
+        _draw_boxed(axes, box, part.surface, edges=False, color=STEEL)
         words = [_size_of(part.name, box), f"volume {1e6 * part.volume:.4g} cm3"]
         words += [f"mass {mass:.4g} kg"]
         words += part.width_words
-        axes.set_title(", ".join(words), loc="left", fontsize=10, parse_math=False)
+        axes.set_title(", ".join(words))
     return figure
 
 
@@ -312,7 +250,7 @@ def caption(view: ArmView, mass: float | None) -> str:
     if view.wall is not None:
         thin, thick = MILLI * view.wall.min(), MILLI * view.wall.max()
         filled = f", wall {thin:.3g} to {thick:.3g} mm"
-    words = [_size_of(view.name, _bounds(view)), f"volume {1e6 * volume:.4g} cm3{filled}"]
+    words = [_size_of(view.name, bounds(view)), f"volume {1e6 * volume:.4g} cm3{filled}"]
     if mass is not None:
         words.append(f"mass {mass:.4g} kg")
     if not len(material(view).triangles):
@@ -325,29 +263,35 @@ def _size_of(name: str, box: Box) -> str:
     return f"{name}:  {x:.4g} x {y:.4g} x {z:.4g} mm"
 
 
-def _bounds(view: ArmView) -> Box:
-    return view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
-
-
 def _seen(box: Box) -> Box:
     """Return the lowest and highest place (2,) of a box in the camera's plane, m."""
     seen = LINKS.plane(box_corners(*box))
     return seen.min(axis=0), seen.max(axis=0)
 
 
-def _box_axes(boxes: Sequence[Box], title: str, foot: float = 0.0) -> tuple[Figure, list[Axes]]:
+def box_rows(boxes: Sequence[Box], title: str, foot: float = 0.0) -> tuple[Figure, list[Axes]]:
     """Return a figure and axes for the boxes (lowest and highest corner (3,), m) of links."""
     return stacked_axes(
         [_seen(box) for box in boxes], title, above=0.4, below=0.5, foot=foot, least=0.3
     )
 
 
-def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool = True, **look: Any) -> None:
-    """Draw a surface in a box, the box's edges if wanted, and lengths."""
-    scale = axes.bbox.width / np.ptp(axes.get_xlim())  # px per m
-    limits = axes.axis()
+def draw_link(
+    axes: Axes, view: ArmView, values: np.ndarray | None, colours: str, largest: float
+) -> None:
+    """Draw a link's material, in the colours of its cells' values if there are any, in its box."""
+    surface, look = material(view), {"color": STEEL}
+    if values is not None:
+        look = {"scalars": values[surface.cells], "cmap": colours, "clim": (0.0, largest)}
+    _draw_boxed(axes, bounds(view), surface, edges=True, **look)
+
+
+def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: Any) -> None:
+    """Draw a surface, the edges of its box if they are wanted, and a ruler along these."""
+    limits = (*axes.get_xlim(), *axes.get_ylim())
+    scale = axes.bbox.width / (limits[1] - limits[0])  # px per m
     studio = Studio(LINKS, *_seen(box), scale)
-    studio.solid(surface, **({"color": STEEL} | look))
+    studio.solid(surface, **look)
     if edges:
         _draw_edges(studio, box)
     studio.show(axes, studio.close())

@@ -1,0 +1,151 @@
+"""A plane machine in a figure: densities of its arms, carts, pedestals, guides, joints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.patches import Polygon
+
+from dolfinopt.multibody.closures import Along, Tie
+from dolfinopt.multibody.tree import GROUND
+from dolfinopt.output.design import ArmView
+from dolfinopt.plots.design import boundary, fill_cells, sides
+from dolfinopt.plots.poses import Poses
+from dolfinopt.plots.style import (
+    COLOURS,
+    DENSITY,
+    GREY,
+    ORANGE,
+    SOLID_FROM,
+    framed_axes,
+    mixed,
+)
+
+BASE = "#c9c9c9"  # carts, pedestals and sliders
+UNDESIGNED = "#8a8a8a"  # arms without a design
+SIDES = (0.75, 0.95)  # inches left and right of the axes, for y and for the scale of colours
+ROOM = 0.1  # around what is seen, of the arms' reach: for the instants
+CART, TOP = np.array([0.06, 0.045]), 0.25  # half width and height of a cart; top of a pedestal
+BLOCK = np.array([0.06, 0.036])  # half length and half height of a slider
+THIN, BAR, DOT = 1.0, 5.0, 5.0  # points: lines, rigid arms, joints
+
+
+class PlaneStage:
+    """The figure of a plane machine, see `machine.Stage`."""
+
+    def __init__(
+        self, views: Sequence[ArmView], poses: Poses, paths: Sequence[np.ndarray], title: str
+    ) -> None:
+        """Draw the ground; lengths on it are in shares of the arms' reach."""
+        self.views, self.poses, size = views, poses, poses.size
+        self.rims = [boundary(view.corners) for view in views]
+        self.stands = np.ptp(poses.held[:, 0], axis=0).max() == 0.0
+        points = np.concatenate([poses.reached(views), *paths])
+        low, high = points.min(axis=0) - ROOM * size, points.max(axis=0) + ROOM * size
+        self.figure, self.axes, _ = framed_axes(low, high, title, SIDES)
+        self.axes.set(xlabel="x [m]", ylabel="y [m]")
+        self.axes.grid(True, alpha=0.3)
+        bar = self.axes.inset_axes((1.02, 0.0, 0.025, 1.0))
+        self.figure.colorbar(ScalarMappable(cmap=COLOURS), cax=bar, label=DENSITY)
+        for tie, ends in zip(poses.loops.ties, poses.tied.swapaxes(0, 1), strict=True):
+            self._draw_closure(tie, ends)
+        if not self.stands:
+            self.axes.axhline(poses.held[0, 0, 1] - CART[1] * size, color=GREY, lw=THIN)
+        self.keep()
+
+    def flat(self, points: np.ndarray) -> np.ndarray:
+        """Return where points (..., 2), m, are in the axes."""
+        return points
+
+    def path(self, points: np.ndarray, colour: str) -> None:
+        """Draw the line through points (n, 2), m."""
+        self.axes.plot(*points.T, color=colour, lw=1.3)
+
+    def pose(self, n: int, strength: float = 1.0) -> None:
+        """Draw arms, their supports and joints at an instant."""
+        poses, size, grey = self.poses, self.poses.size, mixed(BASE, strength)
+        joints = []
+        for i, parent in enumerate(poses.parents):
+            if parent == GROUND:
+                self._draw_support(poses.held[n, i], not self.stands, strength)
+            joints.append(poses.origin[n, i])
+        for i, view in enumerate(self.views):
+            self._draw_arm(i, view, n, strength)
+        for tie, (a, b) in zip(poses.loops.ties, poses.tied[n], strict=True):
+            joints += [a, b] if tie.is_rod else [a]
+            if tie.is_rod:
+                self.axes.plot(*np.stack([a, b]).T, color=mixed(UNDESIGNED, strength), lw=BAR)
+            elif (across := _across(tie)) is not None:
+                corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * BLOCK * size
+                along = np.array([across[1], -across[0]])
+                block = a + corners @ np.stack([along, across])
+                self.axes.add_patch(Polygon(block, fc=grey, ec="black", alpha=0.8, zorder=1.9))
+        self.axes.plot(*np.transpose(joints), "o", mfc="white", mec="black", ms=DOT)
+        colour = mixed(ORANGE, strength)
+        self.axes.plot(
+            *poses.end[n], "o", mfc=colour, mec="black", ms=(2 if poses.payload else 1) * DOT
+        )
+
+    def _draw_arm(self, i: int, view: ArmView, n: int, strength: float) -> None:
+        """Draw an arm's cells where there is material; one without a design as a bar."""
+        if not view.designed:
+            colour, origin = mixed(UNDESIGNED, strength), self.poses.origin[n, i]
+            for site in self.poses.sites(i, n):
+                self.axes.plot(*np.stack([origin, site]).T, color=colour, lw=BAR)
+            return
+        corners = self.poses.material(view.corners, view.modes, i, n)
+        there = view.density > SOLID_FROM
+        fill_cells(self.axes, corners[there], view.density[there], alpha=strength)
+        rim = LineCollection(sides(corners)[self.rims[i]], colors=GREY, lw=0.5 * THIN)
+        self.axes.add_collection(rim, autolim=False)
+
+    def _draw_support(self, place: np.ndarray, moves: bool, strength: float = 1.0) -> None:
+        """Draw a cart below a joint, or a pedestal on its ground."""
+        across, deep = CART * self.poses.size
+        top = across if moves else TOP * across
+        box = np.array([[-across, -deep], [across, -deep], [top, 0.0], [-top, 0.0]])
+        colour = mixed(BASE, strength)
+        self.axes.add_patch(Polygon(place + box, fc=colour, ec="black", zorder=1.5))
+        if not moves:
+            ground = place + np.array([[-2.0 * across, -deep], [2.0 * across, -deep]])
+            self.axes.plot(*ground.T, color=GREY, lw=THIN)
+
+    def _draw_closure(self, tie: Tie, ends: np.ndarray) -> None:
+        """Draw what stands of a closure with the ground, places (2, n, 2), m: guide or pedestal."""
+        if tie.b is not None:
+            return
+        held, point = ends[0], ends[1][0]
+        if (across := _across(tie)) is None:
+            return self._draw_support(point, moves=False)
+        along, half = np.array([across[1], -across[0]]), BLOCK * self.poses.size
+        s = (held - point) @ along
+        stretch = np.array([s.min() - 1.5 * half[0], s.max() + 1.5 * half[0]])
+        for side in (-half[1], half[1]):
+            guide = point + stretch[:, None] * along + side * across
+            self.axes.plot(*guide.T, color=GREY, lw=THIN)
+        return None
+
+    def keep(self) -> None:
+        """Keep what has been drawn so far in all frames."""
+        self.kept = set(self.axes.get_children())
+
+    def clear(self) -> None:
+        """Take away what was drawn since."""
+        for artist in self.axes.get_children():
+            if artist not in self.kept:
+                artist.remove()
+
+    def render(self) -> None:
+        """Nothing: what was drawn is in the figure."""
+
+    def close(self) -> None:
+        """Nothing has to be freed."""
+
+
+def _across(tie: Tie) -> np.ndarray | None:
+    """Return the unit vector across a slider's line (2,); None of other closures."""
+    first = tie.equations[0]
+    return first.e if len(tie.equations) == 1 and isinstance(first, Along) else None
