@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dolfinopt.arms.arm import fixed_body
 from dolfinopt.disk import (
     append_text,
     open_input,
@@ -21,7 +20,6 @@ from dolfinopt.disk import (
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.solid_cells import TENSOR
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.scene.law_variables import LAW, law_names, law_values, with_law
@@ -139,7 +137,7 @@ def _views(
     for index, owner in enumerate(scene.owners):
         name = scene.arms[index].name
         if owner is None:
-            views.append(FIXED_VIEWS[scene.dimension](scene.arms[index], fixed_body(scene, index)))
+            views.append(_undesigned_view(scene.arms[index], scene.dimension))
             continue
         order = canonical_order(centroids[owner])
         around = TENSOR[corners[owner].shape[1:]]
@@ -182,41 +180,16 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
     return tuple(found)
 
 
-def _box_view(arm: ArmKeys, body: ShapeIntegrals) -> ArmView:
-    """Return a rigid box from inboard to outboard."""
-    side = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])  # of y and z
-    faces = [
-        np.column_stack([np.full(4, x), side * [arm.height, arm.thickness]])
-        for x in (0.0, arm.length)
-    ]
-    corners = np.concatenate(faces)[None]
-    modes = np.zeros((*corners.shape, 0))
-    return ArmView(arm.name, corners, corners.mean(axis=1), np.ones(1), modes, False, arm.length)
-
-
-def _bar_view(arm: ArmKeys, body: ShapeIntegrals) -> ArmView:
-    """Return a body whose shape is not known as a bar from joint to joint."""
-    # Between them it bends like a beam without loads: cubic polynomials that fit the outboard
-    # interface's displacement and rotation.
-    length = float(np.hypot(*body.outboard_point))
-    axis = np.array([*body.outboard_point]) / length
-    across = np.array([-axis[1], axis[0]])
-    s = np.linspace(0.0, 1.0, 21)
-    station = np.stack([s[:-1], s[1:], s[1:], s[:-1]], axis=1)  # (n_cells, 4)
-    side = 0.5 * arm.height * np.array([-1.0, -1.0, 1.0, 1.0])
-    corners = length * station[..., None] * axis + side[:, None] * across
-    u, v = axis @ body.outboard[:2], across @ body.outboard[:2]
-    bend, turn = 3.0 * station**2 - 2.0 * station**3, length * (station**3 - station**2)
-    slope = (6.0 * station - 6.0 * station**2) / length, 3.0 * station**2 - 2.0 * station
-    deflection = bend[..., None] * v + turn[..., None] * body.outboard[2]
-    rotation = slope[0][..., None] * v + slope[1][..., None] * body.outboard[2]
-    along = station[..., None] * u - side[:, None] * rotation
-    modes = along[:, :, None] * axis[:, None] + deflection[:, :, None] * across[:, None]
-    density = np.ones(len(corners))
-    return ArmView(arm.name, corners, corners.mean(axis=1), density, modes, False, length)
-
-
-FIXED_VIEWS = {2: _bar_view, 3: _box_view}
+def _undesigned_view(arm: ArmKeys, dimension: int) -> ArmView:
+    """Return an arm without a design as one box from joint to joint, undeformed."""
+    ring = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    corners = (ring + np.array([0.5, 0.0])) * [arm.length, arm.height]
+    if dimension == 3:
+        section = ring * [arm.height, arm.thickness]
+        ends = [np.column_stack([np.full(4, x), section]) for x in (0.0, arm.length)]
+        corners = np.concatenate(ends)
+    modes, centroid = np.zeros((1, *corners.shape, 0)), corners.mean(axis=0)
+    return ArmView(arm.name, corners[None], centroid[None], np.ones(1), modes, False, arm.length)
 
 
 def canonical_order(points: np.ndarray) -> np.ndarray:
