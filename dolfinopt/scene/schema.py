@@ -368,7 +368,7 @@ class Scene(Table):
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):
                 if isinstance(table, Table):
-                    table.check_in_scene(self, (key, i) if tables is value else (key,))
+                    table.check_at(self, (key, i) if tables is value else (key,))
         return self
 
 

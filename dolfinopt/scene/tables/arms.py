@@ -311,13 +311,13 @@ class Arm(Table):
             raise Refusal(
                 f"expected only one of design, pattern, rigid and sid, found "
                 f"{' and '.join(stated)}",
-                *((key,) for key in stated),
+                *stated,
             )
         if self.regions and not self.flexible:
             raise Refusal(
                 f"expected none with {stated[0]}: only an arm with cells has regions",
-                ("regions",),
-                (stated[0],),
+                "regions",
+                stated[0],
             )
         return self
 
@@ -325,11 +325,11 @@ class Arm(Table):
     def _check_thickness(self) -> Arm:
         for key in ("symmetric", "extruded"):
             if getattr(self, key) and not self.is_solid and (key, self.symmetric) != (key, True):
-                raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", (key,))
+                raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", key)
         if self.extruded and self.cells is None:
-            raise Refusal("expected only with cells = [nx, ny, nz]", ("extruded",), ("mesh",))
+            raise Refusal("expected only with cells = [nx, ny, nz]", "extruded", "mesh")
         for number, region in enumerate(self.regions):
-            key = "regions", number, "depth"
+            key = f"regions.{number}.depth"
             if region.depth is not None and not self.is_solid:
                 raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", key)
             if region.depth is not None and self.extruded:
@@ -337,7 +337,7 @@ class Arm(Table):
                     "expected none with extruded = true: the design is the same through the "
                     "thickness",
                     key,
-                    ("extruded",),
+                    "extruded",
                 )
         return self
 
@@ -346,7 +346,7 @@ class Arm(Table):
         if not self.hollow:
             for key in WALL_KEYS:
                 if getattr(self, key) is not None:
-                    raise Refusal("expected only with hollow = true", (key,))
+                    raise Refusal("expected only with hollow = true", key)
             return self
         if not self.flexible:
             return self
@@ -354,36 +354,36 @@ class Arm(Table):
             raise Refusal(
                 "expected false without cells = [nx, ny, nz]: the hull of a hollow arm is a box "
                 "or a tube",
-                ("hollow",),
-                *((("mesh",),) if self.mesh is not None else ()),
+                "hollow",
+                *(["mesh"] if self.mesh is not None else []),
             )
         if self.wall is None:
             raise Refusal(
                 "expected a number > 0 [m], the wall's initial thickness, with hollow = true",
-                ("wall",),
-                ("hollow",),
+                "wall",
+                "hollow",
             )
         for key in ("extruded", "pattern", "regions", "interfaces"):
             if getattr(self, key):
-                raise Refusal("expected none with hollow = true", (key,), ("hollow",))
+                raise Refusal("expected none with hollow = true", key, "hollow")
         if self.element not in (None, "incompatible"):
             raise Refusal(
                 'expected "incompatible" with hollow = true: others lock in a wall of one layer',
-                ("element",),
-                ("hollow",),
+                "element",
+                "hollow",
             )
         if (around := self.cells_around) > MOST_AROUND:
             raise Refusal(
                 f"expected at most {MOST_AROUND} cells round the section with hollow = true, "
                 f"2 (ny + nz), found {around}",
-                ("cells",),
+                "cells",
             )
         if self.ribs and RIB_PITCH * (self.ribs + 1) > self.cells[0]:
             raise Refusal(
                 f"expected at most {max(0, self.cells[0] // RIB_PITCH - 1)} with "
                 f"{self.cells[0]} cells along the arm, {RIB_PITCH} from rib to rib",
-                ("ribs",),
-                ("cells",),
+                "ribs",
+                "cells",
             )
         self._check_wall()
         return self
@@ -393,33 +393,31 @@ class Arm(Table):
         least, most = self.wall_limits
         if self.hull is not None and Path(self.hull).suffix.lower() != ".msh":
             words = " | ".join(map(shown, (True, *SECTIONS)))
-            raise Refusal(f"expected {words}, or a file that ends in .msh", ("hollow",))
+            raise Refusal(f"expected {words}, or a file that ends in .msh", "hollow")
         if self.hollow == "tube" and self.height != self.thickness:
             raise Refusal(
                 f'expected thickness = {self.thickness} [m], the diameter, with hollow = "tube"',
-                ("height",),
-                ("thickness",),
+                "height",
+                "thickness",
             )
         half = 0.5 * min(self.height, self.thickness)
         if most >= half:
             raise Refusal(
                 f"expected less than half the section's smaller side, {half:.6g} [m], found "
                 f"{most:.6g}",
-                ("max_wall",) if self.max_wall is not None else ("wall",),
-                ("height",),
-                ("thickness",),
+                "max_wall" if self.max_wall is not None else "wall",
+                "height",
+                "thickness",
             )
         if least >= most:
-            raise Refusal(
-                f"expected less than max_wall = {most:.6g} [m]", ("min_wall",), ("max_wall",)
-            )
+            raise Refusal(f"expected less than max_wall = {most:.6g} [m]", "min_wall", "max_wall")
         assert self.wall is not None
         if not least <= self.wall <= most:
             raise Refusal(
                 f"expected a number from min_wall = {least:.6g} to max_wall = {most:.6g} [m]",
-                ("wall",),
-                ("min_wall",),
-                ("max_wall",),
+                "wall",
+                "min_wall",
+                "max_wall",
             )
 
     @property
@@ -452,7 +450,7 @@ class Arm(Table):
     def _check_joint(self) -> Arm:
         for key in ("mass", "inertia", "centre"):
             if getattr(self, key) is not None and not self.rigid:
-                raise Refusal("expected only with rigid = true", (key,), ("rigid",))
+                raise Refusal("expected only with rigid = true", key, "rigid")
         check_parts(self, "arms")
         return self
 
@@ -474,12 +472,12 @@ class Arm(Table):
     @model_validator(mode="after")
     def _check_ends(self) -> Arm:
         if self.length < SHORTEST and not (self.rigid and self.length == 0.0):
-            raise Refusal(f"expected a number >= {SHORTEST:g} and <= 10000 [m]", ("length",))
+            raise Refusal(f"expected a number >= {SHORTEST:g} and <= 10000 [m]", "length")
         if self.rigid and self.length == 0.0:
             return self
         if 2.0 * self.solid_ends >= self.length:
             raise Refusal(
-                f"expected less than half of length = {self.length} [m]", ("passive",), ("length",)
+                f"expected less than half of length = {self.length} [m]", "passive", "length"
             )
         return self
 
@@ -499,46 +497,44 @@ class Arm(Table):
         if self.mesh is None:
             for key in (*SIZE_KEYS, "mesh_scale", *["interface_offset"] * (self.hull is None)):
                 if getattr(self, key) != Arm.model_fields[key].default:
-                    raise Refusal("expected only with mesh; a rectangular arm has cells", (key,))
+                    raise Refusal("expected only with mesh; a rectangular arm has cells", key)
             return self
         if self.mesh_scale != 1.0 and Path(self.mesh).suffix.lower() in STEP_FILES:
-            raise Refusal("expected none: a STEP file states its unit", ("mesh_scale",), ("mesh",))
+            raise Refusal("expected none: a STEP file states its unit", "mesh_scale", "mesh")
         if self.interface_offset is not None and not self.is_solid:
-            raise Refusal("expected only with the mesh of a solid arm", ("interface_offset",))
+            raise Refusal("expected only with the mesh of a solid arm", "interface_offset")
         if self.cells is not None:
             raise Refusal(
                 "expected either cells (a rectangular arm) or mesh (a file), not both",
-                ("mesh",),
-                ("cells",),
+                "mesh",
+                "cells",
             )
         if self.mesh_size is not None and self.mesh_size > self.height:
             raise Refusal(
                 f"expected at most height = {self.height} [m]: a cell must fit into the arm",
-                ("mesh_size",),
-                ("height",),
+                "mesh_size",
+                "height",
             )
         kind = Path(self.mesh).suffix.lower()
         if kind not in MESH_FILES:
-            raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", ("mesh",))
+            raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", "mesh")
         for key in SIZE_KEYS:
             told = key == "cell_shape" and self.cell_shape in SOLID_SHAPES
             if kind in (".msh", ".inp") and getattr(self, key) is not None and not told:
                 raise Refusal(
                     f"expected only with .geo or .step: a {kind} file has its cells",
-                    (key,),
-                    ("mesh",),
+                    key,
+                    "mesh",
                 )
         if kind == ".inp" and not self.is_solid:
             raise Refusal(
                 'expected "tetrahedron" or "hexahedron" with a .inp file, whose cells are solid',
-                ("cell_shape",),
-                ("mesh",),
+                "cell_shape",
+                "mesh",
             )
         if self.element == "incompatible" and self.cell_shape in SIMPLICES:
             cells = "triangles" if self.cell_shape == "triangle" else "tetrahedra"
-            raise Refusal(
-                f'expected "linear" or "quadratic" with {cells}', ("element",), ("cell_shape",)
-            )
+            raise Refusal(f'expected "linear" or "quadratic" with {cells}', "element", "cell_shape")
         return self
 
     @property
@@ -688,48 +684,47 @@ class Arm(Table):
         before = scene.arms[: at[-1]]
         # Some file systems do not tell capitals apart.
         if self.name.casefold() in (arm.name.casefold() for arm in before):
-            raise Refusal("expected a name that no other arm has", (*at, "name"))
+            raise Refusal("expected a name that no other arm has", ".name")
         if not scene.is_spatial:
-            self._check_files(before, at)
-            check_plane_bearing(self, at)
+            self._check_files(before)
+            check_plane_bearing(self)
         if self.is_solid and self.flexible and not scene.is_spatial:
             raise Refusal(
                 "expected two integers (along, across) of an arm in plane stress: a solid arm "
                 "moves in space, and needs [[joints]]",
-                (*at, "cells" if self.cells is not None else "cell_shape"),
+                ".cells" if self.cells is not None else ".cell_shape",
             )
         if self.flexible:
-            self._check_material(scene, at)
-        self._check_inertia(scene, at)
+            self._check_material(scene, at[-1])
+        self._check_inertia(scene)
         check_interfaces(scene, at[-1])
         check_motor(scene, at[-1])
-        check_regions(self, at)
+        check_regions(self)
         if self.pattern is not None:
-            self._check_pattern(before, at)
+            self._check_pattern(before)
         if self.design is not None:
-            self._check_shared(before, at)
+            self._check_shared(before)
 
-    def _check_material(self, scene: Scene, at: Loc) -> None:
+    def _check_material(self, scene: Scene, index: int) -> None:
         """Refuse an own material, or the scene's, that this arm cannot be made of."""
-        solid = scene.material_of(at[-1])
+        solid = scene.material_of(index)
         if self.hollow and solid.angle_axis is not None:
             raise Refusal(
                 "expected none with hollow = true: the angle turns about the wall's normal",
-                (*at, "angle_axis"),
-                (*at, "hollow"),
+                ".angle_axis",
+                ".hollow",
             )
         try:
             solid.check_law(3 if self.is_solid else 2)
         except Refusal as refusal:
             own = self.material is not None or vars(self)["kind"] is not None
-            owners = (
-                at if own or getattr(self, key) is not None else ("material",)
+            keys = (
+                f".{key}" if own or getattr(self, key) is not None else f"material.{key}"
                 for (key,) in refusal.keys
             )
-            keys = ((*owner, *key) for owner, key in zip(owners, refusal.keys, strict=True))
             raise Refusal(refusal.reason, *keys) from None
 
-    def _check_files(self, before: tuple[Arm, ...], at: Loc) -> None:
+    def _check_files(self, before: tuple[Arm, ...]) -> None:
         """Refuse a name with which two files of a part would be one, such as a_face.step."""
         own = self.name.casefold()
         for other in (arm.name.casefold() for arm in before):
@@ -738,30 +733,30 @@ class Arm(Table):
                     raise Refusal(
                         f"expected a name that is not another arm's with {' or '.join(PART_FILES)} "
                         "behind it: files of both parts would have one name",
-                        (*at, "name"),
+                        ".name",
                     )
 
-    def _check_inertia(self, scene: Scene, at: Loc) -> None:
+    def _check_inertia(self, scene: Scene) -> None:
         """Refuse what a rigid arm in the plane cannot have, and inertia that no body has."""
         plane = "without [[joints]]: the machine moves in the plane"
         if scene.is_spatial:
             if problem := tensor_problem(self.inertia):
-                raise Refusal(problem, (*at, "inertia"))
+                raise Refusal(problem, ".inertia")
             return
         if self.length == 0.0:
-            raise Refusal(f"expected more than 0 {plane}", (*at, "length"))
+            raise Refusal(f"expected more than 0 {plane}", ".length")
         if isinstance(self.inertia, tuple):
-            raise Refusal(f"expected a number {plane}", (*at, "inertia"))
+            raise Refusal(f"expected a number {plane}", ".inertia")
         if self.centre is not None:
-            raise Refusal(f"expected none {plane}", (*at, "centre"))
+            raise Refusal(f"expected none {plane}", ".centre")
 
-    def _check_shared(self, before: tuple[Arm, ...], at: Loc) -> None:
+    def _check_shared(self, before: tuple[Arm, ...]) -> None:
         owners = {arm.name: arm for arm in before if arm.own}
         if self.design not in owners:
             allowed = " | ".join(map(shown, owners)) or "no arm before it has one"
             raise Refusal(
                 f"expected the name of an earlier arm with a design of its own: {allowed}",
-                (*at, "design"),
+                ".design",
             )
         for key in Arm.model_fields:
             value = getattr(owners[self.design], key)
@@ -774,11 +769,11 @@ class Arm(Table):
                     expected = f"no value, as in {self.design}"
                 raise Refusal(
                     f"expected {expected}, whose design it shares",
-                    (*at, key),
-                    (*at, "design"),
+                    f".{key}",
+                    ".design",
                 )
 
-    def _check_pattern(self, before: tuple[Arm, ...], at: Loc) -> None:
+    def _check_pattern(self, before: tuple[Arm, ...]) -> None:
         """Refuse a pattern that is none, or whose cells are not this arm's one by one."""
         designed = {arm.name: arm for arm in before if arm.designed}
         if self.pattern not in designed:
@@ -788,29 +783,29 @@ class Arm(Table):
             hint = f"; {self.pattern} itself has that of {origin}" if origin else ""
             raise Refusal(
                 f"expected the name of an earlier arm with a design of its own: {allowed}{hint}",
-                (*at, "pattern"),
+                ".pattern",
             )
         pattern = designed[self.pattern]
         if pattern.interfaces:
             raise Refusal(
                 f"expected an arm without interfaces: {self.pattern} has some, around which cells "
                 "stay solid",
-                (*at, "pattern"),
+                ".pattern",
             )
         for one, name in ((pattern, self.pattern), (self, self.name)):
             if one.mesh is not None:
                 raise Refusal(
                     f"expected an arm made of cells, and cells of its own: {name} has mesh = "
                     f"{shown(one.mesh)}, whose cells have no partners in another arm",
-                    (*at, "pattern"),
-                    (*at, "mesh"),
+                    ".pattern",
+                    ".mesh",
                 )
         if self.cells != pattern.cells:
             raise Refusal(
                 f"expected {shown(pattern.cells)} as {self.pattern} has, whose design it repeats "
                 "cell by cell",
-                (*at, "cells"),
-                (*at, "pattern"),
+                ".cells",
+                ".pattern",
             )
         for key in PATTERN_KEYS:
             stated, theirs = getattr(self, key), getattr(pattern, key)
@@ -818,8 +813,8 @@ class Arm(Table):
                 raise Refusal(
                     f"expected none: it is that of {self.pattern}, scaled, whose design this arm "
                     "repeats",
-                    (*at, key),
-                    (*at, "pattern"),
+                    f".{key}",
+                    ".pattern",
                 )
 
 

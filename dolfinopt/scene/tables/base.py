@@ -41,13 +41,27 @@ Loc = tuple[Any, ...]  # path of a key in the scene's data, e.g. ("arms", 0, "le
 class Refusal(ValueError):
     """Reject a value for a reason that needs more than one key or a sentence of its own.
 
-    `keys` are paths below the refusing model; the first one is reported, all are involved.
+    `keys` are paths, dotted or as tuples; the first one is reported, all are involved. Validators
+    of a table give them from that table, `check_in_scene` from the scene, but for those that begin
+    with a dot, which are the table's own.
     """
 
-    def __init__(self, reason: str, *keys: Loc):
+    def __init__(self, reason: str, *keys: str | Loc):
         super().__init__(reason)
         self.reason = reason
-        self.keys = keys
+        self.keys = tuple(map(loc_of, keys))
+
+    def below(self, at: Loc) -> Refusal:
+        """Return it with all keys from the scene, for a table at `at`."""
+        keys = ((*at, *key[1:]) if key and key[0] == "" else key for key in self.keys)
+        return Refusal(self.reason, *keys)
+
+
+def loc_of(path: str | Loc) -> Loc:
+    """Return a dotted path as a tuple; numbers are places in arrays."""
+    if isinstance(path, tuple):
+        return path
+    return tuple(int(part) if part.isdigit() else part for part in path.split("."))
 
 
 class Table(BaseModel):
@@ -83,8 +97,19 @@ class Table(BaseModel):
         """Check what this table at `at` and other tables of `scene` must agree on.
 
         Raises:
-            Refusal: they do not; its keys are paths from the scene.
+            Refusal: they do not.
         """
+
+    def check_at(self, scene: Scene, at: Loc) -> None:
+        """Do so; the refusal's keys are paths from the scene.
+
+        Raises:
+            Refusal: they do not agree.
+        """
+        try:
+            self.check_in_scene(scene, at)
+        except Refusal as refusal:
+            raise refusal.below(at) from None
 
     def refuse_unused(self, used: bool, choice: str, *keys: str) -> None:
         """Raise unless `keys` have their defaults, or are `used` with this value of `choice`."""
@@ -94,9 +119,7 @@ class Table(BaseModel):
                 continue
             expected = "none" if default is None else f"{shown(default)}, the default,"
             found = f"{type(self).__name__.lower()}.{choice} = {shown(getattr(self, choice))}"
-            raise Refusal(
-                f"expected {expected} with {found}, which does not use it", (key,), (choice,)
-            )
+            raise Refusal(f"expected {expected} with {found}, which does not use it", key, choice)
 
     @field_validator("*", mode="before")
     @classmethod
@@ -113,7 +136,7 @@ class Table(BaseModel):
         return value
 
 
-def refuse_count(values: object, names: Sequence[str], at: Loc) -> None:
+def refuse_count(values: object, names: Sequence[str], at: str | Loc) -> None:
     """Raise Refusal for an array that has not one number for each of the names."""
     if isinstance(values, tuple) and len(values) != len(names):
         number = "1 number" if len(names) == 1 else f"{len(names)} numbers"

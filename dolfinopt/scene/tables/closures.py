@@ -138,7 +138,7 @@ class Closures(Table):
         for key in needed.get(self.kind, ()):
             if getattr(self, key) is None:
                 reason = f"expected an array of three numbers with a {self.kind}"
-                raise Refusal(reason, (key,), ("kind",))
+                raise Refusal(reason, key, "kind")
         if self.kind == "universal":
             self._check_cross()
         return self
@@ -147,56 +147,56 @@ class Closures(Table):
         assert self.axis is not None and self.cross_axis is not None
         along = sum(a * b for a, b in zip(self.axis, self.cross_axis, strict=False))
         if abs(along) > 1e-6 * math.hypot(*self.axis) * math.hypot(*self.cross_axis):
-            raise Refusal("expected a direction across closures.axis", ("cross_axis",), ("axis",))
+            raise Refusal("expected a direction across closures.axis", "cross_axis", "axis")
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
         taken = [joint.name for joint in scene.joints]
         taken += [one.name for one in scene.closures[: at[-1]]]
         if self.name.casefold() in map(str.casefold, taken):
-            raise Refusal("expected a name that no joint or other closure has", (*at, "name"))
-        self._check_ends(scene, at)
+            raise Refusal("expected a name that no joint or other closure has", ".name")
+        self._check_ends(scene)
         if scene.is_spatial:
-            self._check_in_space(scene, at)
+            self._check_in_space(scene)
         else:
-            self._check_in_plane(scene, at)
+            self._check_in_plane(scene)
 
-    def _check_in_space(self, scene: Scene, at: Loc) -> None:
+    def _check_in_space(self, scene: Scene) -> None:
         """Refuse what is of the plane, and what a loop in space cannot be combined with."""
         if self.side != 1:
             raise Refusal(
                 "expected 1, the default, with [[joints]]: motion.initial_joints says which way "
                 "the loop is assembled",
-                (*at, "side"),
-                ("joints",),
+                ".side",
+                "joints",
             )
         if self.kind == "pin" and self.axis is None:
-            raise Refusal("expected an array of three numbers with a pin", (*at, "axis"))
+            raise Refusal("expected an array of three numbers with a pin", ".axis")
         for key in ("point", "axis"):
             if len(getattr(self, key) or ()) == 2:
-                raise Refusal("expected an array of three numbers with [[joints]]", (*at, key))
+                raise Refusal("expected an array of three numbers with [[joints]]", f".{key}")
         if self.is_spring and scene.control is not None:
             raise Refusal(
                 "expected 0 with [control]: a driven rod has its drive's gains there",
-                (*at, "stiffness"),
-                ("control",),
+                ".stiffness",
+                "control",
             )
         if need_of(scene, "eigenproblem") and scene.objective.attached != "none":
             raise Refusal(
                 'expected "none" with [[closures]]: what a link carries through a loop does not '
                 "vibrate with it; take a response of the motion, or links that carry nothing",
-                ("objective", "attached"),
-                (*at, "kind"),
+                "objective.attached",
+                ".kind",
             )
         if not scene.driven:
             raise Refusal(
                 "expected a joint without passive = true, or a rod without length: nothing is "
                 "driven",
-                ("joints", 0, "passive"),
-                (*at, "kind"),
+                "joints.0.passive",
+                ".kind",
             )
 
-    def _check_in_plane(self, scene: Scene, at: Loc) -> None:
+    def _check_in_plane(self, scene: Scene) -> None:
         """Refuse all but one pin or slider at the chain's end, and what it rules out."""
         ends = [place_of(scene, end) for end in self.between]
         alone = ends == [(len(scene.arms) - 1, 0), None] and len(scene.closures) == 1
@@ -204,36 +204,36 @@ class Closures(Table):
             raise Refusal(
                 "expected one pin or slider between the last arm and the ground without "
                 "[[joints]]: more is closed in space, with [[joints]] about the plane's normal",
-                (*at, "kind"),
-                ("arms",),
+                ".kind",
+                "arms",
             )
         if any(self.point[2:]):
-            raise Refusal("expected an array of two numbers without [[joints]]", (*at, "point"))
+            raise Refusal("expected an array of two numbers without [[joints]]", ".point")
         axis = self.axis or (0.0, 0.0, 1.0)
         if any(axis[:2] if self.kind == "pin" else axis[2:]):
             expected = "[0, 0, 1], the default" if self.kind == "pin" else "two numbers"
-            raise Refusal(f"expected {expected}, without [[joints]]", (*at, "axis"))
+            raise Refusal(f"expected {expected}, without [[joints]]", ".axis")
         if len(scene.arms) <= scene.dependent_joints:
             raise Refusal(
                 f'expected kind = "{self.kind}" with at least {scene.dependent_joints + 1} arms, '
                 f"found {len(scene.arms)}",
-                (*at, "kind"),
-                ("arms",),
+                ".kind",
+                "arms",
             )
         if scene.motion.base != "fixed":
-            raise Refusal('expected "fixed" with [[closures]]', ("motion", "base"), (*at, "kind"))
+            raise Refusal('expected "fixed" with [[closures]]', "motion.base", ".kind")
         if scene.motion.path not in ("rotation", "joints"):
             raise Refusal(
                 'expected "rotation" or "joints" with [[closures]] without [[joints]]: the motion '
                 "prescribes the joints that are independent",
-                ("motion", "path"),
-                (*at, "kind"),
+                "motion.path",
+                ".kind",
             )
-        self._check_springs(scene, at)
+        self._check_springs(scene)
         if self.kind == "pin":
-            self._check_pin(scene, at)
+            self._check_pin(scene)
 
-    def _check_springs(self, scene: Scene, at: Loc) -> None:
+    def _check_springs(self, scene: Scene) -> None:
         """Refuse springs between drive and arm at joints of the plane that have no drive."""
         first = len(scene.arms) - scene.dependent_joints
         for index, arm in enumerate(scene.arms):
@@ -241,37 +241,37 @@ class Closures(Table):
                 raise Refusal(
                     f"expected 0: the joint of {arm.name} follows from the others in the closed "
                     "loop and has no drive",
-                    ("arms", index, "gear_stiffness"),
-                    (*at, "kind"),
+                    f"arms.{index}.gear_stiffness",
+                    ".kind",
                 )
             if arm.bearing_stiffness is not None:
                 raise Refusal(
                     "expected none with [[closures]] without [[joints]]: state [[joints]] about "
                     "the plane's normal, or leave it out",
-                    ("arms", index, "bearing_stiffness"),
-                    (*at, "kind"),
+                    f"arms.{index}.bearing_stiffness",
+                    ".kind",
                 )
 
-    def _check_pin(self, scene: Scene, at: Loc) -> None:
+    def _check_pin(self, scene: Scene) -> None:
         """Refuse responses of the deviation of an end that a pin holds, and forces along a line."""
         for n, force in enumerate(scene.forces):
             if force.name == OLD:
                 reason = "expected 0.0, the default, with a pin: its end does not move"
-                raise Refusal(reason, ("forces", n, "factor"), (*at, "kind"))
+                raise Refusal(reason, f"forces.{n}.factor", ".kind")
         for key in set(OF_THE_END).intersection(one.name for one in asked(scene)):
-            place = ("objective", "kind") if scene.objective.kind == key else ("constraints", key)
+            place = "objective.kind" if scene.objective.kind == key else f"constraints.{key}"
             raise Refusal(
                 "expected another response with a pin: the end of the last arm is held, it "
                 "deviates from nothing; take the compliance",
                 place,
-                (*at, "kind"),
+                ".kind",
             )
 
-    def _check_ends(self, scene: Scene, at: Loc) -> None:
-        check_site(scene, self.between[0], (*at, "between"))
-        check_site(scene, self.between[1], (*at, "between"), (GROUND,))
+    def _check_ends(self, scene: Scene) -> None:
+        check_site(scene, self.between[0], ".between")
+        check_site(scene, self.between[1], ".between", (GROUND,))
         if site_of(self.between[0])[0] == site_of(self.between[1])[0]:
-            raise Refusal("expected interfaces of two arms", (*at, "between"))
+            raise Refusal("expected interfaces of two arms", ".between")
 
 
 # -- `[closure]`, an older word -------------------------------------------------------------------

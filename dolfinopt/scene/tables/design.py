@@ -157,8 +157,8 @@ class Design(Table):
             raise Refusal(
                 'expected 0, the default, unless design.projection = "robust": the others do not '
                 "control the width",
-                (key,),
-                ("projection",),
+                key,
+                "projection",
             )
         # The width that `WIDEST` gives, in widths of `erosion`.
         ratio = math.acosh(1.0 / (1.0 - 2.0 * WIDEST)) / math.acosh(
@@ -171,17 +171,17 @@ class Design(Table):
             raise Refusal(
                 f"expected at most {ratio * thin:.4g} [m], {ratio:.3g} times {other} = {thin}, "
                 f"with erosion = {self.erosion}; lower erosion or widen the other",
-                (wider,),
-                (other,),
-                ("erosion",),
+                wider,
+                other,
+                "erosion",
             )
         default = type(self).model_fields["filter_radius"].default
         if self.filter_radius not in (default, self.radius):
             raise Refusal(
                 f"expected {default}, the default, with {key} = {stated[key]}: "
                 f"the radius that gives this width is {self.radius:.6g} [m]",
-                ("filter_radius",),
-                (key,),
+                "filter_radius",
+                key,
             )
         return self
 
@@ -197,14 +197,12 @@ class Design(Table):
     @model_validator(mode="after")
     def _check_minimum(self) -> Design:
         if self.minimum >= self.initial:
-            raise Refusal(
-                f"expected less than initial = {self.initial} [-]", ("minimum",), ("initial",)
-            )
+            raise Refusal(f"expected less than initial = {self.initial} [-]", "minimum", "initial")
         if self.volume_fraction is not None and self.minimum > self.volume_fraction:
             raise Refusal(
                 f"expected at most volume_fraction = {self.volume_fraction} [-]",
-                ("minimum",),
-                ("volume_fraction",),
+                "minimum",
+                "volume_fraction",
             )
         return self
 
@@ -219,8 +217,8 @@ class Design(Table):
             raise Refusal(
                 f"expected at most the length of the longest arm, {longest} [m]: a wider filter "
                 "leaves one density for a whole arm",
-                ("design", "filter_radius"),
-                *(("arms", i, "length") for i in range(len(scene.arms))),
+                "design.filter_radius",
+                *(f"arms.{i}.length" for i in range(len(scene.arms))),
             )
         self._check_volume(scene)
 
@@ -230,8 +228,8 @@ class Design(Table):
         if hollow and self.projection:
             raise Refusal(
                 "expected false with a hollow arm: a wall may have any thickness",
-                ("design", "projection"),
-                ("arms", hollow[0], "hollow"),
+                "design.projection",
+                f"arms.{hollow[0]}.hollow",
             )
         if not hollow or len(hollow) < len(scene.designed):
             return
@@ -244,8 +242,8 @@ class Design(Table):
                 raise Refusal(
                     f"expected {shown(default)}, the default, where all arms are hollow: "
                     f"{words.get(key, 'cells are solid')}",
-                    (table, key),
-                    ("arms", hollow[0], "hollow"),
+                    f"{table}.{key}",
+                    f"arms.{hollow[0]}.hollow",
                 )
 
     def _check_member_width(self, scene: Scene) -> None:
@@ -255,7 +253,7 @@ class Design(Table):
             smallest = f'arm "{arm.name}"' if scale == 1.0 else f'what repeats arm "{arm.name}"'
             if arm.cell_size is not None:  # else known with the mesh, see `Arm`
                 for key, reason in self.too_narrow(smallest, scale * arm.cell_size):
-                    raise Refusal(reason, ("design", key), ("arms", i, "height"))
+                    raise Refusal(reason, f"design.{key}", f"arms.{i}.height")
             member, gap = self.least_widths
             if 2.0 * member + gap > height * (1.0 + 1e-9):
                 reason = (
@@ -267,8 +265,8 @@ class Design(Table):
                         f"expected two members of {member} [m] and a gap of {gap} [m] within the "
                         f"height of {smallest}, {height:.4g} [m]"
                     )
-                keys = [("design", key) for key in self.stated_widths]
-                raise Refusal(reason, *keys, ("arms", i, "height"))
+                keys = [f".{key}" for key in self.stated_widths]
+                raise Refusal(reason, *keys, f"arms.{i}.height")
 
     def _check_volume(self, scene: Scene) -> None:
         limit = self.volume_fraction
@@ -290,19 +288,19 @@ class Design(Table):
                         f"and the solid ends are {share:.4g} of the volume, with design.minimum = "
                         f"{self.minimum} in the rest; make them smaller or raise the volume "
                         "fraction",
-                        ("arms", i, "regions"),
-                        ("arms", i, "passive"),
-                        ("design", "volume_fraction"),
+                        f"arms.{i}.regions",
+                        f"arms.{i}.passive",
+                        "design.volume_fraction",
                     )
                 raise Refusal(
                     f"expected a length with which volume_fraction = {limit} can be met: the solid "
                     f"ends are {share:.4g} of the volume, with design.minimum = {self.minimum} "
                     "between them; shorten passive (0: no solid ends) or raise the volume fraction",
-                    ("arms", i, "passive"),
-                    ("arms", i, "length"),
-                    ("arms", i, "cells"),
-                    ("design", "volume_fraction"),
-                    ("design", "minimum"),
+                    f"arms.{i}.passive",
+                    f"arms.{i}.length",
+                    f"arms.{i}.cells",
+                    "design.volume_fraction",
+                    "design.minimum",
                 )
 
 
@@ -338,13 +336,13 @@ class Region(Table):
             raise Refusal(
                 "expected one of box = [x0, y0, x1, y1] and circle = [x, y, radius] "
                 f"{'beside' if self.box is None else 'alone, not both, beside'} kind",
-                ("kind",),
-                *(() if self.box is None else (("box",), ("circle",))),
+                "kind",
+                *([] if self.box is None else ["box", "circle"]),
             )
         if self.box is not None and not (self.box[0] < self.box[2] and self.box[1] < self.box[3]):
-            raise Refusal("expected [x0, y0, x1, y1] with x0 < x1 and y0 < y1 [m]", ("box",))
+            raise Refusal("expected [x0, y0, x1, y1] with x0 < x1 and y0 < y1 [m]", "box")
         if self.depth is not None and not self.depth[0] < self.depth[1]:
-            raise Refusal("expected [z0, z1] with z0 < z1 [m]", ("depth",))
+            raise Refusal("expected [z0, z1] with z0 < z1 [m]", "depth")
         return self
 
     @property
@@ -385,30 +383,26 @@ class Region(Table):
         return (x - middle_x) ** 2 + (y - middle_y) ** 2 <= (radius * (1.0 + BORDER)) ** 2
 
 
-def check_regions(arm: Arm, at: Loc) -> None:
+def check_regions(arm: Arm) -> None:
     """Refuse a region outside a rectangular arm; other things the mesh must tell.
 
-    Args:
-        arm: at this place of the scene.
-        at: the place.
-
     Raises:
-        Refusal: its keys are paths from the scene.
+        Refusal: its keys are the arm's own.
     """
     if not arm.regions or arm.cells is None:
         return
     for number, region in enumerate(arm.regions):
-        _check_place(region, arm, (*at, "regions", number), at)
+        _check_place(region, arm, f".regions.{number}")
     from dolfinopt.scene.regions import MOST_CELLS, grid_regions  # NumPy
 
     problem = grid_regions(arm)[1] if arm.n_cells <= MOST_CELLS else None
     if problem is not None:
         number, reason = problem
         shape = arm.regions[number].shape
-        raise Refusal(reason, (*at, "regions", number, shape), (*at, "passive"), (*at, "cells"))
+        raise Refusal(reason, f".regions.{number}.{shape}", ".passive", ".cells")
 
 
-def _check_place(region: Region, arm: Arm, key: Loc, at: Loc) -> None:
+def _check_place(region: Region, arm: Arm, at: str) -> None:
     """Refuse a region beside a box, or above or below it."""
     x0, y0, x1, y1 = region.bounds
     half, deep = 0.5 * arm.height, 0.5 * arm.thickness
@@ -416,15 +410,15 @@ def _check_place(region: Region, arm: Arm, key: Loc, at: Loc) -> None:
         raise Refusal(
             f"expected a place in the arm, x from 0 to {arm.length} and y from {-half:g} "
             f"to {half:g} [m]",
-            (*key, region.shape),
-            (*at, "length"),
-            (*at, "height"),
+            f"{at}.{region.shape}",
+            ".length",
+            ".height",
         )
     if region.depth is not None and (region.depth[0] >= deep or region.depth[1] <= -deep):
         raise Refusal(
             f"expected a place in the arm, z from {-deep:g} to {deep:g} [m]",
-            (*key, "depth"),
-            (*at, "thickness"),
+            f"{at}.depth",
+            ".thickness",
         )
 
 

@@ -49,27 +49,25 @@ class FeedForward(Table):
         if not self.on:
             for key in ("joints", "spacing", "lead"):
                 if getattr(self, key) is not None:
-                    raise Refusal('expected none without feed_forward.kind = "tip"', (*at, key))
+                    raise Refusal('expected none without feed_forward.kind = "tip"', f".{key}")
             return
         if scene.control is not None and scene.control.feed_forward != "tip":
             raise Refusal(
                 'expected "none" with [control], unless control.feed_forward = "tip"',
-                (*at, "kind"),
-                ("control", "feed_forward"),
+                ".kind",
+                "control.feed_forward",
             )
         if scene.is_pinned:
             raise Refusal(
-                'expected "none": a pin holds the end-effector, which has no path', (*at, "kind")
+                'expected "none": a pin holds the end-effector, which has no path', ".kind"
             )
         if scene.motion.table_ends == "moving":
             raise Refusal(
                 'expected "rest" with feed_forward.kind = "tip", whose corrections begin at rest',
-                ("motion", "table_ends"),
-                (*at, "kind"),
+                "motion.table_ends",
+                ".kind",
             )
         for name in self.joints or ():
             if name not in scene.driven:
                 known = ", ".join(scene.driven)
-                raise Refusal(
-                    f"expected drives, of {known}; {shown(name)} is none", (*at, "joints")
-                )
+                raise Refusal(f"expected drives, of {known}; {shown(name)} is none", ".joints")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from dolfinopt.scene.tables.base import Length, Loc, Position, Refusal, Table, shown
+from dolfinopt.scene.tables.base import Length, Position, Refusal, Table, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -89,7 +89,7 @@ def place_of(scene: Scene, text: str) -> tuple[int, int] | None:
     return None if k is None else (k, interface_number(scene.arms[k], interface) or 0)
 
 
-def check_site(scene: Scene, text: str, at: Loc, also: tuple[str, ...] = ()) -> None:
+def check_site(scene: Scene, text: str, at: str, also: tuple[str, ...] = ()) -> None:
     """Refuse what is no interface of an arm, nor one of the words `also`, such as "ground"."""
     name, interface = site_of(text)
     arms = {arm.name: arm for arm in scene.arms}
@@ -106,24 +106,24 @@ def check_site(scene: Scene, text: str, at: Loc, also: tuple[str, ...] = ()) -> 
 
 def check_interfaces(scene: Scene, index: int) -> None:
     """Refuse interfaces that an arm cannot have, or on which nothing sits."""
-    arm, at = scene.arms[index], ("arms", index)
+    arm = scene.arms[index]
     if not arm.interfaces:
         return
     if not scene.is_spatial:
         raise Refusal(
             "expected none without [[joints]]: an arm in the plane carries the next one at its end",
-            (*at, "interfaces"),
+            ".interfaces",
         )
     if arm.pattern is not None:
-        raise Refusal("expected none with pattern", (*at, "interfaces"), (*at, "pattern"))
+        raise Refusal("expected none with pattern", ".interfaces", ".pattern")
     celled = arm.flexible and arm.cells is not None
     known = [one.name.casefold() for one in arm.interfaces]
     for k, one in enumerate(arm.interfaces):
-        here = (*at, "interfaces", k)
+        here = f".interfaces.{k}"
         if one.name.casefold() in known[:k]:
-            raise Refusal("expected a name that no other interface of the arm has", (*here, "name"))
+            raise Refusal("expected a name that no other interface of the arm has", f"{here}.name")
         if one.axis is not None and (arm.mesh is None or not arm.flexible):
-            raise Refusal("expected only with a mesh file, whose bore it is", (*here, "axis"))
+            raise Refusal("expected only with a mesh file, whose bore it is", f"{here}.axis")
         if (one.radius is None) == (celled or one.axis is not None):
             made = "a rigid arm" if arm.rigid else "an arm made of cells"
             if arm.sid is not None:
@@ -133,7 +133,7 @@ def check_interfaces(scene: Scene, index: int) -> None:
             if one.axis is not None:
                 made = "the axis of a bore"
             expected = "a number > 0 [m]" if one.radius is None else "none"
-            raise Refusal(f"expected {expected} with {made}", (*here, "radius"))
+            raise Refusal(f"expected {expected} with {made}", f"{here}.radius")
 
 
 def check_used(scene: Scene) -> None:
@@ -147,8 +147,8 @@ def check_used(scene: Scene) -> None:
                 raise Refusal(
                     f'expected a joint with parent = "{arm.name}.{one.name}", one of [[closures]], '
                     "the payload or one of [[forces]] there: nothing sits on it",
-                    ("arms", index, "interfaces", arm.interfaces.index(one), "name"),
-                    ("joints",),
+                    f"arms.{index}.interfaces.{arm.interfaces.index(one)}.name",
+                    "joints",
                 )
 
 
@@ -168,27 +168,25 @@ def check_bores(arm: Arm) -> None:
     ends = {one.name.strip().casefold(): k for k, one in enumerate(arm.interfaces)}
     bores = [ends[name] for name in (INBOARD, OUTBOARD) if name in ends]
     for k in bores:
-        at = ("interfaces", k)
+        at = f"interfaces.{k}"
         if arm.mesh is None or not arm.is_solid:
-            raise Refusal(
-                "expected only with the mesh file of a solid arm", (*at, "name"), ("mesh",)
-            )
+            raise Refusal("expected only with the mesh file of a solid arm", f"{at}.name", "mesh")
         if len(bores) == 1:
             raise Refusal(
                 f'expected interfaces "{INBOARD}" and "{OUTBOARD}": both place the arm\'s frame',
-                (*at, "name"),
+                f"{at}.name",
             )
         for key in ("axis", "radius"):
             if getattr(arm.interfaces[k], key) is None:
-                raise Refusal("expected those of the bore", (*at, key), (*at, "name"))
+                raise Refusal("expected those of the bore", f"{at}.{key}", f"{at}.name")
     if bores:
         apart = math.dist(*(arm.interfaces[k].point for k in bores))
         if abs(apart - arm.length) > SAME_LENGTH * arm.length:
             raise Refusal(
                 f"expected {apart:.6g} [m], the distance of the points of the interfaces "
                 f'"{INBOARD}" and "{OUTBOARD}"',
-                ("length",),
-                ("interfaces", bores[1], "point"),
+                "length",
+                f"interfaces.{bores[1]}.point",
             )
 
 
@@ -333,30 +331,30 @@ def check_parts(one: _Table, table: str) -> None:
     if one.gear_damping > 0.0 and one.gear_stiffness == 0.0:
         raise Refusal(
             f"expected 0 without {table}.gear_stiffness, beside whose spring the damper acts",
-            ("gear_damping",),
-            ("gear_stiffness",),
+            "gear_damping",
+            "gear_stiffness",
         )
     if one.friction is None and one.friction_speed != FRICTION_SPEED:
-        raise Refusal(f"expected none without {table}.friction", ("friction_speed",))
+        raise Refusal(f"expected none without {table}.friction", "friction_speed")
     springs = one.bearing_stiffness or (0.0,) * 6
     for i, damper in enumerate(one.bearing_damping or ()):
         if damper > 0.0 and springs[i] == 0.0:
             raise Refusal(
                 f"expected 0 as number {i + 1}: {table}.bearing_stiffness has no spring there, "
                 "beside which the damper would act",
-                ("bearing_damping",),
-                ("bearing_stiffness",),
+                "bearing_damping",
+                "bearing_stiffness",
             )
 
 
-def check_plane_bearing(one: _Table, at: Loc) -> None:
+def check_plane_bearing(one: _Table) -> None:
     """Refuse springs of a bearing in directions that the plane does not have."""
     for i, direction in OUT_OF_PLANE.items():
         if one.bearing_stiffness is not None and one.bearing_stiffness[i] > 0.0:
             raise Refusal(
                 f"expected 0 or inf as number {i + 1}, {direction}: without [[joints]] the machine "
                 "moves in the plane, which holds it there",
-                (*at, "bearing_stiffness"),
+                ".bearing_stiffness",
             )
 
 
@@ -396,38 +394,38 @@ def _part(arm: Arm, joint: Joint | None, key: str) -> Any:
 
 def check_motor(scene: Scene, index: int) -> None:
     """Refuse a rotor of unknown speed, and a motor's gear at a joint that nothing drives."""
-    arm, at = scene.arms[index], ("arms", index)
+    arm, at = scene.arms[index], ""
     held = [(k, one) for k, one in enumerate(scene.joints) if one.child == arm.name]
     joint = held[0][1] if held else None
     if _part(arm, joint, "rotor_inertia") and _part(arm, joint, "gear_ratio") is None:
         if joint is not None and stated_at(joint, "rotor_inertia"):
-            at = ("joints", held[0][0])
+            at = f"joints.{held[0][0]}"
         raise Refusal(
             "expected gear_ratio with it, the rotor's revolutions per revolution of the joint; "
             "1 of a motor without a gear",
-            (*at, "rotor_inertia"),
-            (*at, "gear_ratio"),
+            f"{at}.rotor_inertia",
+            f"{at}.gear_ratio",
         )
     rotors = ["rotor_inertia" in one.model_fields_set for one in (*scene.arms, *scene.joints)]
     # Older files hold the ratio of 1 that was the default.
     if stated_at(arm, "gear_ratio") and arm.gear_ratio != 1.0 and not any(rotors):
         raise Refusal(
             "expected none: used only with rotor_inertia, whose turns it counts",
-            ("arms", index, "gear_ratio"),
-            ("arms", index, "rotor_inertia"),
+            ".gear_ratio",
+            ".rotor_inertia",
         )
     if held:
-        _check_in_space(arm, at, *held[0])
+        _check_in_space(arm, index, *held[0])
 
 
-def _check_in_space(arm: Arm, at: Loc, number: int, joint: Joint) -> None:
+def _check_in_space(arm: Arm, index: int, number: int, joint: Joint) -> None:
     """Refuse parts of a joint that arm and joint state, or that it cannot have."""
-    own = ("joints", number)
+    own = f"joints.{number}"
     if joint.passive and _part(arm, joint, "gear_stiffness"):
         raise Refusal(
             f"expected 0: the joint {joint.name} has passive = true and no motor behind a spring",
-            (*(own if joint.gear_stiffness else at), "gear_stiffness"),
-            (*own, "passive"),
+            f"{own if joint.gear_stiffness else ''}.gear_stiffness",
+            f"{own}.passive",
         )
     for key in DRIVE_KEYS:
         if not stated_at(arm, key):
@@ -435,15 +433,15 @@ def _check_in_space(arm: Arm, at: Loc, number: int, joint: Joint) -> None:
         if not joint.moves and key not in OF_BEARINGS:
             raise Refusal(
                 f"expected none: the joint {joint.name} that holds the arm is fixed",
-                (*at, key),
-                (*own, "type"),
+                f".{key}",
+                f"{own}.type",
             )
         if stated_at(joint, key):
             raise Refusal(
-                f"expected only one of joints.{number}.{key} and arms.{at[1]}.{key}, which mean "
+                f"expected only one of joints.{number}.{key} and arms.{index}.{key}, which mean "
                 "the same joint",
-                (*own, key),
-                (*at, key),
+                f"{own}.{key}",
+                f".{key}",
             )
 
 

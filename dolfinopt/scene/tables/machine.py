@@ -123,16 +123,16 @@ class Joint(Table):
     def _check_limits(self) -> Joint:
         for key in LIMITS:
             if getattr(self, key) is not None and not self.moves:
-                raise Refusal("expected none with a fixed joint", (key,), ("type",))
+                raise Refusal("expected none with a fixed joint", key, "type")
         if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
-            raise Refusal("expected the least first, then the largest", ("position_limits",))
+            raise Refusal("expected the least first, then the largest", "position_limits")
         return self
 
     @model_validator(mode="after")
     def _check_parts(self) -> Joint:
         for key in DRIVE_KEYS if not self.moves else ():
             if key not in OF_BEARINGS and stated_at(self, key):
-                raise Refusal("expected none with a fixed joint", (key,), ("type",))
+                raise Refusal("expected none with a fixed joint", key, "type")
         check_parts(self, "joints")
         return self
 
@@ -140,10 +140,10 @@ class Joint(Table):
     def _check_axis(self) -> Joint:
         if self.axis is None and self.moves:
             raise Refusal(
-                f"expected an array of three numbers with a {self.type} joint", ("axis",), ("type",)
+                f"expected an array of three numbers with a {self.type} joint", "axis", "type"
             )
         if self.axis is not None and not self.moves:
-            raise Refusal("expected none with a fixed joint", ("axis",), ("type",))
+            raise Refusal("expected none with a fixed joint", "axis", "type")
         return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
@@ -154,18 +154,18 @@ class Joint(Table):
         """
         before = scene.joints[: at[-1]]
         if self.name.casefold() in (joint.name.casefold() for joint in before):
-            raise Refusal("expected a name that no other joint has", (*at, "name"))
+            raise Refusal("expected a name that no other joint has", ".name")
         names = [arm.name for arm in scene.arms]
         if self.child not in names:
             allowed = " | ".join(map(shown, names))
-            raise Refusal(f"expected the name of an arm: {allowed}", (*at, "child"))
-        check_site(scene, self.parent, (*at, "parent"), (GROUND,))
+            raise Refusal(f"expected the name of an arm: {allowed}", ".child")
+        check_site(scene, self.parent, ".parent", (GROUND,))
         for other in before:
             if other.child == self.child:
                 raise Refusal(
                     f"expected an arm that no other joint holds: {self.child} hangs on "
                     f"{other.name}; a joint that closes a loop is one of [[closures]]",
-                    (*at, "child"),
+                    ".child",
                 )
         if len(before) == len(scene.joints) - 1:
             _check_tree(scene)
@@ -180,11 +180,11 @@ def _check_tree(scene: Scene) -> None:
         if arm.name == GROUND:
             raise Refusal(
                 'expected another name: with [[joints]] "ground" is what the machine stands on',
-                ("arms", k, "name"),
+                f"arms.{k}.name",
             )
         if arm.name not in parents:
             raise Refusal(
-                "expected one of [[joints]] whose child it is", ("arms", k, "name"), ("joints",)
+                "expected one of [[joints]] whose child it is", f"arms.{k}.name", "joints"
             )
     for i, joint in enumerate(scene.joints):
         passed, above = [joint.child], joint.parent_arm
@@ -195,20 +195,18 @@ def _check_tree(scene: Scene) -> None:
             raise Refusal(
                 f"expected a tree that stands on the ground: from {joint.child} its parents lead "
                 f"to {above} again",
-                ("joints", i, "parent"),
+                f"joints.{i}.parent",
             )
     if not any(joint.moves for joint in scene.joints):
-        raise Refusal(
-            'expected a "revolute" or "prismatic" joint: nothing moves', ("joints", 0, "type")
-        )
+        raise Refusal('expected a "revolute" or "prismatic" joint: nothing moves', "joints.0.type")
 
 
 def _check_passive(scene: Scene) -> None:
     """Refuse joints without drives where no loop moves them."""
     for i, joint in enumerate(scene.joints):
-        at = ("joints", i, "passive")
+        at = f"joints.{i}.passive"
         if joint.passive and not joint.moves:
-            raise Refusal("expected none with a fixed joint", at, ("joints", i, "type"))
+            raise Refusal("expected none with a fixed joint", at, f"joints.{i}.type")
         if joint.passive and not scene.closures:
             raise Refusal(
                 "expected false, the default, without [[closures]]: no loop moves the joint", at
@@ -220,48 +218,48 @@ def _check_machine(scene: Scene) -> None:
     motion = scene.motion
     if motion.path not in PATHS:
         allowed = " | ".join(map(shown, PATHS))
-        raise Refusal(f"expected {allowed} with [[joints]]", ("motion", "path"), ("joints",))
+        raise Refusal(f"expected {allowed} with [[joints]]", "motion.path", "joints")
     for key in ("start", "end"):
         if motion.path == "line" and len(getattr(motion, key)) == 2:
             raise Refusal(
-                "expected an array of three numbers with [[joints]]", ("motion", key), ("joints",)
+                "expected an array of three numbers with [[joints]]", f"motion.{key}", "joints"
             )
     movable = scene.movable
     if motion.path == "joints" and motion.initial_joints is not None and not scene.closures:
         raise Refusal(
             'expected none with motion.path = "joints", which does not use it without [[closures]]',
-            ("motion", "initial_joints"),
-            ("motion", "path"),
+            "motion.initial_joints",
+            "motion.path",
         )
     if motion.initial_joints is not None and len(motion.initial_joints) != len(movable):
         names = ", ".join(joint.name for joint in movable)
-        raise Refusal(f"expected {len(movable)} numbers, of {names}", ("motion", "initial_joints"))
+        raise Refusal(f"expected {len(movable)} numbers, of {names}", "motion.initial_joints")
     for key in PLANE_KEYS:
         default = type(motion).model_fields[key].default
         if getattr(motion, key) != default:
             raise Refusal(
                 f"expected {shown(default)}, the default, with [[joints]], which say where the "
                 "machine stands",
-                ("motion", key),
-                ("joints",),
+                f"motion.{key}",
+                "joints",
             )
     if len(motion.gravity) == 2 and any(motion.gravity):
         raise Refusal(
-            "expected an array of three numbers with [[joints]]", ("motion", "gravity"), ("joints",)
+            "expected an array of three numbers with [[joints]]", "motion.gravity", "joints"
         )
     if scene.objective.elbow_angle is not None:
         raise Refusal(
             "expected none with [[joints]]: links vibrate in the pose at the middle of the motion",
-            ("objective", "elbow_angle"),
-            ("joints",),
+            "objective.elbow_angle",
+            "joints",
         )
     for k, arm in enumerate(scene.arms):
         if arm.flexible and not arm.is_solid:
             raise Refusal(
                 "expected three integers (along, over the height, over the thickness) with "
                 "[[joints]]: an arm that moves in space is a solid, or rigid = true",
-                ("arms", k, "cells"),
-                ("joints",),
+                f"arms.{k}.cells",
+                "joints",
             )
 
 
@@ -306,14 +304,12 @@ class Control(Table):
         if self.feed_forward == "elastic" and not any(one.stiffness for one in joint_parts(scene)):
             raise Refusal(
                 'expected "rigid": no joint has a gear that gives way; state gear_stiffness',
-                (*at, "feed_forward"),
+                ".feed_forward",
             )
         if self.feed_forward == "tip" and not scene.feed_forward.on:
-            raise Refusal(
-                'expected "rigid" without feed_forward.kind = "tip"', (*at, "feed_forward")
-            )
+            raise Refusal('expected "rigid" without feed_forward.kind = "tip"', ".feed_forward")
         for key in ("stiffness", "damping", "limits"):
-            refuse_count(getattr(self, key), scene.driven, (*at, key))
+            refuse_count(getattr(self, key), scene.driven, f".{key}")
 
 
 # -- `[damping]` ---------------------------------------------------------------------------------
@@ -360,21 +356,17 @@ class Payload(Table):
             if isinstance(self.inertia, tuple):
                 raise Refusal(
                     "expected a number without [[joints]]: the machine moves in the plane",
-                    (*at, "inertia"),
+                    ".inertia",
                 )
             if any(self.offset):
-                raise Refusal(
-                    "expected [0, 0, 0], the default, without [[joints]]", (*at, "offset")
-                )
+                raise Refusal("expected [0, 0, 0], the default, without [[joints]]", ".offset")
             if self.arm is not None:
-                raise Refusal(
-                    "expected none without [[joints]]: the last arm carries it", (*at, "arm")
-                )
+                raise Refusal("expected none without [[joints]]: the last arm carries it", ".arm")
             return
         if problem := tensor_problem(self.inertia):
-            raise Refusal(problem, (*at, "inertia"))
+            raise Refusal(problem, ".inertia")
         if self.arm is not None:
-            check_site(scene, self.arm, (*at, "arm"))
+            check_site(scene, self.arm, ".arm")
         check_used(scene)
 
 
@@ -433,7 +425,7 @@ class Force(Table):
     @model_validator(mode="after")
     def _check_given(self) -> Force:
         if self.force is None and self.moment is None and self.table is None:
-            raise Refusal("expected force, moment, or table = a file: nothing acts", ("force",))
+            raise Refusal("expected force, moment, or table = a file: nothing acts", "force")
         return self
 
     def force_in(self, dimension: int) -> tuple[float, ...]:
@@ -449,20 +441,20 @@ class Force(Table):
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what acts nowhere, has another dimension, or a key that nothing uses."""
         if self.name and self.name in [one.name for one in scene.forces[: at[-1]]]:
-            raise Refusal("expected a name that no other force has", (*at, "name"))
-        check_site(scene, self.arm, (*at, "arm"))
+            raise Refusal("expected a name that no other force has", ".name")
+        check_site(scene, self.arm, ".arm")
         where = "with [[joints]]" if scene.is_spatial else "without [[joints]]: in the plane"
         if self.force is not None and len(self.force) != scene.dimension:
             numbers = "three numbers" if scene.is_spatial else "two numbers"
-            raise Refusal(f"expected an array of {numbers} {where}", (*at, "force"))
+            raise Refusal(f"expected an array of {numbers} {where}", ".force")
         if self.moment is not None and isinstance(self.moment, tuple) != scene.is_spatial:
             expected = "an array of three numbers" if scene.is_spatial else "a number"
-            raise Refusal(f"expected {expected} {where}", (*at, "moment"))
+            raise Refusal(f"expected {expected} {where}", ".moment")
         if not self.feed_forward and (
             scene.control is None or scene.control.feed_forward == "none"
         ):
             raise Refusal(
                 "expected true, the default, without a feed-forward: "
                 '[control] with feed_forward = "rigid"',
-                (*at, "feed_forward"),
+                ".feed_forward",
             )

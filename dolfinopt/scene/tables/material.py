@@ -161,17 +161,17 @@ class Material(Table):
         for key in material_keys():
             given, optional = getattr(self, key, None) is not None, key not in OF_ALL
             if given and optional and key not in self.law.used:
-                raise Refusal(f"expected none {kind}", (key,), ("kind",))
+                raise Refusal(f"expected none {kind}", key, "kind")
             if not given and (not optional or key in self.law.keys):
                 meaning = type(self).model_fields[key].description
-                raise Refusal(f"expected a value {kind}: {meaning}", (key,), ("kind",))
+                raise Refusal(f"expected a value {kind}: {meaning}", key, "kind")
         if self.kind == "orthotropic":
             check_orthotropic(self, dim)
             return
         if isinstance(self.young_modulus, tuple):
-            raise Refusal(f"expected a number {kind}", ("young_modulus",), ("kind",))
+            raise Refusal(f"expected a number {kind}", "young_modulus", "kind")
         if isinstance(nu := self.poisson_ratio, tuple) or not -0.99 <= nu < 0.5:
-            raise Refusal(f"expected a number >= -0.99 and < 0.5 {kind}", ("poisson_ratio",))
+            raise Refusal(f"expected a number >= -0.99 and < 0.5 {kind}", "poisson_ratio")
 
 
 def material_keys() -> list[str]:
@@ -188,11 +188,11 @@ def check_orthotropic(solid: Material, dim: int | None) -> None:
     """Refuse constants of which some deformation would release energy."""
     young, ratio = solid.young_modulus, solid.poisson_ratio
     if not isinstance(young, tuple):
-        raise Refusal('expected [E1, E2] with kind = "orthotropic"', ("young_modulus",), ("kind",))
+        raise Refusal('expected [E1, E2] with kind = "orthotropic"', "young_modulus", "kind")
     for key, most in (("young_modulus", 2), ("poisson_ratio", 1), ("shear_modulus", 1)):
         value = getattr(solid, key)
         if dim == 2 and isinstance(value, tuple) and len(value) > most:
-            raise Refusal(f"expected {most} of an arm in plane stress, not 3", (key,))
+            raise Refusal(f"expected {most} of an arm in plane stress, not 3", key)
     E = young[0], young[1], young[-1]
     in_space = dim == 3 or isinstance(ratio, tuple)
     ratios = ratio if isinstance(ratio, tuple) else (ratio,) * 3
@@ -202,15 +202,15 @@ def check_orthotropic(solid: Material, dim: int | None) -> None:
             raise Refusal(
                 f"expected |nu{i + 1}{j + 1}| < sqrt(E{i + 1}/E{j + 1}) = "
                 f"{(E[i] / E[j]) ** 0.5:.4g}: otherwise a deformation would release energy",
-                ("poisson_ratio",),
-                ("young_modulus",),
+                "poisson_ratio",
+                "young_modulus",
             )
     a, b, c = scaled
     if in_space and a * a + b * b + c * c + 2.0 * a * b * c >= 1.0:
         raise Refusal(
             "expected smaller ratios: with all three a deformation would release energy",
-            ("poisson_ratio",),
-            ("young_modulus",),
+            "poisson_ratio",
+            "young_modulus",
         )
     if solid.angle_axis is not None and not any(solid.angle_axis):
-        raise Refusal("expected a direction, not three zeros", ("angle_axis",))
+        raise Refusal("expected a direction, not three zeros", "angle_axis")

@@ -173,11 +173,11 @@ class Motion(Table):
         if tabulated and self.file is None:
             raise Refusal(
                 f'expected the path of a table (CSV) with motion.path = "{self.path}"',
-                ("file",),
-                ("path",),
+                "file",
+                "path",
             )
         if self.path == "line" and self.start == self.end:
-            raise Refusal("expected another point than motion.start", ("end",), ("start",))
+            raise Refusal("expected another point than motion.start", "end", "start")
         self.refuse_unused(self.path == "arc", "path", "radius", "flattening")
         self.refuse_unused(self.path == "line", "path", "start", "end", "rpy")
         self.refuse_unused(self.path != "arc", "path", "initial_joints")
@@ -187,7 +187,7 @@ class Motion(Table):
         joints = self.path in ("joints", "rotation")
         self.refuse_unused(not joints, "path", "cart_follow", "elbow")
         if self.path == "rotation" and self.base != "fixed":
-            raise Refusal('expected "fixed" with motion.path = "rotation"', ("base",), ("path",))
+            raise Refusal('expected "fixed" with motion.path = "rotation"', "base", "path")
         self.refuse_unused(self.base == "cart", "base", "cart_follow", "cart_mass")
         self.refuse_unused(self.base == "fixed", "base", "base_position")
         self._check_law()
@@ -205,14 +205,14 @@ class Motion(Table):
             raise Refusal(
                 f"expected {shown(share)}, the default, with motion.{last}, which determines "
                 "how long the law accelerates",
-                ("acceleration_share",),
-                (last,),
+                "acceleration_share",
+                last,
             )
         if self.horizon < self.duration:
             raise Refusal(
                 f"expected at least motion.duration = {self.duration:g} [s], the end of the path",
-                ("horizon",),
-                ("duration",),
+                "horizon",
+                "duration",
             )
 
     @property
@@ -233,15 +233,15 @@ class Motion(Table):
                 raise Refusal(
                     "expected [start, end] of every dwell, start before end, one after the other "
                     "[s]",
-                    ("dwells",),
+                    "dwells",
                 )
             last = end
         if last > self.horizon:
             raise Refusal(
                 f"expected dwells that end by motion.horizon = {self.horizon:g} [s]; end them "
                 "sooner or simulate longer",
-                ("dwells",),
-                ("horizon",),
+                "dwells",
+                "horizon",
             )
         return self
 
@@ -260,7 +260,7 @@ class Motion(Table):
             raise Refusal(
                 f"expected at least {least:.6g} [s] by the limits ({', '.join(limits)}); leave it "
                 "out to use this value, or raise the limits",
-                ("motion", "duration"),
+                "motion.duration",
                 *(("motion", key) for key in limits),
             )
 
@@ -270,8 +270,8 @@ class Motion(Table):
             raise Refusal(
                 f"expected motion.duration = {self.duration:g} [s], the end of the table, with "
                 'motion.table_ends = "moving": nothing says how the machine moves on',
-                ("motion", "horizon"),
-                ("motion", "table_ends"),
+                "motion.horizon",
+                "motion.table_ends",
             )
         if self.coefficients or scene.objective.kind == "duration":
             self._check_designed_law(scene)
@@ -281,7 +281,7 @@ class Motion(Table):
                     raise Refusal(
                         "expected none without variables of the law (motion.shape): limit a given "
                         f"law by motion.max_{key[5:]}",
-                        ("constraints", key),
+                        f"constraints.{key}",
                     )
         self._check_limits()
         if scene.is_spatial:
@@ -291,25 +291,25 @@ class Motion(Table):
                 raise Refusal(
                     "expected an array of two numbers without [[joints]]: the machine moves in "
                     "the plane",
-                    ("motion", key),
+                    f"motion.{key}",
                 )
         for key in ("rpy", *([] if scene.closures else ["initial_joints"])):
             if getattr(self, key) is not None:
                 raise Refusal(
                     "expected none without [[joints]]: the machine moves in the plane",
-                    ("motion", key),
+                    f"motion.{key}",
                 )
         if self.initial_joints is not None and len(self.initial_joints) != len(scene.arms):
             raise Refusal(
                 f"expected {len(scene.arms)} numbers, the angles of all arms' joints",
-                ("motion", "initial_joints"),
+                "motion.initial_joints",
             )
         independent = len(scene.arms) - scene.dependent_joints
         if self.path == "rotation" and independent > 1:
             raise Refusal(
                 f'expected "joints" with {independent} independent joints: a rotation prescribes '
                 "one",
-                ("motion", "path"),
+                "motion.path",
             )
         if len(scene.arms) > 1 or self.path in ("joints", "rotation"):
             return
@@ -317,27 +317,27 @@ class Motion(Table):
             raise Refusal(
                 f'expected "cart" with one arm and motion.path = "{self.path}": a single joint '
                 'follows no path; prescribe its angle with motion.path = "joints"',
-                ("motion", "base"),
-                ("motion", "path"),
+                "motion.base",
+                "motion.path",
             )
         if self.cart_follow != type(self).model_fields["cart_follow"].default:
             raise Refusal(
                 "expected 0.5, the default, with one arm: the path determines the position "
                 "of the cart",
-                ("motion", "cart_follow"),
+                "motion.cart_follow",
             )
 
     def _check_designed_law(self, scene: Scene) -> None:
         """Refuse what a law with variables cannot be combined with."""
         key = ("motion", "shape") if self.coefficients else ("objective", "kind")
         if len(self.coefficients) > MOST_COEFFICIENTS:
-            raise Refusal(f"expected at most {MOST_COEFFICIENTS} coefficients", ("motion", "shape"))
+            raise Refusal(f"expected at most {MOST_COEFFICIENTS} coefficients", "motion.shape")
         rates = any(one in scene.constraints.limits for one in OF_PATH)
         if self.path in ("points", "joints") or (rates and self.path == "rotation"):
             raise Refusal(
                 'expected "arc" or "line", or "rotation" without limits along the path: the '
                 "instants of a table's rows would move",
-                ("motion", "path"),
+                "motion.path",
                 key,
             )
         for limit in OF_PATH:
@@ -350,20 +350,20 @@ class Motion(Table):
         if scene.feed_forward.on:
             raise Refusal(
                 'expected "none": corrections of joints do not follow a law with variables',
-                ("feed_forward", "kind"),
+                "feed_forward.kind",
                 key,
             )
         if scene.objective.gradient != "exact":
             raise Refusal(
                 'expected "exact": frozen loads say nothing of the law',
-                ("objective", "gradient"),
+                "objective.gradient",
                 key,
             )
         for k, one in enumerate(scene.scenarios):
             if any(change.lstrip().startswith("motion.") for change in one.changes):
                 raise Refusal(
                     "expected no changes of the motion, whose law has variables",
-                    ("scenarios", k, "changes"),
+                    f"scenarios.{k}.changes",
                     key,
                 )
 
@@ -402,8 +402,8 @@ class Simulation(Table):
         if not 1.0 <= self.num_samples(horizon) <= MAX_SAMPLES:
             raise Refusal(
                 f"expected between {horizon / MAX_SAMPLES} and motion.horizon = {horizon} [s]",
-                ("simulation", "sample"),
-                ("motion", "horizon"),
+                "simulation.sample",
+                "motion.horizon",
             )
 
     def num_samples(self, horizon: float) -> float:
@@ -458,9 +458,9 @@ class Reduction(Table):
         if given is None:
             return self
         if self.method == "krylov" and (not given or len(set(given)) < len(given)):
-            raise Refusal("expected at least one number >= 0, none of them twice", ("frequencies",))
+            raise Refusal("expected at least one number >= 0, none of them twice", "frequencies")
         if self.method == "balanced" and (len(given) != 2 or given[0] >= given[1]):
-            raise Refusal("expected two frequencies, the lower one first", ("frequencies",))
+            raise Refusal("expected two frequencies, the lower one first", "frequencies")
         return self
 
     @model_validator(mode="after")
@@ -471,15 +471,15 @@ class Reduction(Table):
             raise Refusal(
                 'expected an integer >= 3 with reduction.method = "craig-bampton" '
                 "(its constraint modes)",
-                ("coordinates",),
-                ("method",),
+                "coordinates",
+                "method",
             )
         raise Refusal(
             f'expected an integer >= {self.fewest} with reduction.method = "krylov" '
             "(the interface loads at each of reduction.frequencies)",
-            ("coordinates",),
-            ("method",),
-            ("frequencies",),
+            "coordinates",
+            "method",
+            "frequencies",
         )
 
     @property
@@ -515,20 +515,20 @@ class Reduction(Table):
                     )
                 raise Refusal(
                     f"expected an integer >= {least} with a solid arm: its outboard {has}",
-                    ("reduction", "coordinates"),
-                    ("arms", i, "cells"),
+                    "reduction.coordinates",
+                    f"arms.{i}.cells",
                 )
             if arm.flexible and arm.n_reducible is not None and self.count > arm.n_reducible:
                 raise Refusal(
                     f"expected at most {arm.n_reducible}, the degrees of freedom of "
                     f'arm "{arm.name}" with cells = {list(arm.cells or ())}',
-                    ("reduction", "coordinates"),
-                    ("arms", i, "cells"),
+                    "reduction.coordinates",
+                    f"arms.{i}.cells",
                 )
         if self.method == "balanced" and not scene.damping.stiffness_proportional:
             raise Refusal(
                 'expected a number > 0 with reduction.method = "balanced": the Gramian of '
                 "undamped resonances is infinite",
-                ("damping", "stiffness_proportional"),
-                ("reduction", "method"),
+                "damping.stiffness_proportional",
+                "reduction.method",
             )

@@ -183,8 +183,8 @@ class Objective(Table):
                 raise Refusal(
                     f"expected {', '.join(moving[:-1])} or {moving[-1]}, or a limit of one under "
                     "[constraints], with [[scenarios]]: the others do not simulate the motion",
-                    ("objective", "kind"),
-                    ("scenarios", 0, "changes"),
+                    "objective.kind",
+                    "scenarios.0.changes",
                 )
             return
         self._check_exact(scene)
@@ -197,7 +197,7 @@ class Objective(Table):
             raise Refusal(
                 f'expected "craig-bampton", "modal" or "krylov" with {because}: '
                 f"the Gramian's basis has no adjoint{remedy}",
-                ("reduction", "method"),
+                "reduction.method",
                 key,
             )
 
@@ -224,14 +224,14 @@ class Objective(Table):
             expected = "none" if default is None else f"{shown(default)}, the default,"
             raise Refusal(
                 f"expected {expected} without {users}: nothing else uses it",
-                ("objective", key),
-                ("objective", "kind"),
+                f"objective.{key}",
+                "objective.kind",
             )
         if not scene.scenarios and self.scenarios != fields["scenarios"].default:
             raise Refusal(
                 f"expected {shown(fields['scenarios'].default)}, the default, without "
                 "[[scenarios]]: there are none to combine",
-                ("objective", "scenarios"),
+                "objective.scenarios",
             )
 
     def _check_weights(self, scene: Scene) -> None:
@@ -242,7 +242,7 @@ class Objective(Table):
             number = "1 number" if len(drives) == 1 else f"{len(drives)} numbers"
             raise Refusal(
                 f"expected {number}, for {', '.join(drives)}, not all of them 0",
-                ("objective", "effort_weights"),
+                "objective.effort_weights",
             )
 
     def static_loads(self, scene: Scene) -> tuple[Load | SpatialLoad, ...]:
@@ -255,7 +255,7 @@ class Objective(Table):
         count = 6 if scene.is_spatial else 3
         if any(len(load) != count for load in self.static_loads(scene)):
             what = "six numbers, force and moment, with" if count == 6 else "three numbers without"
-            raise Refusal(f"expected arrays of {what} [[joints]]", ("objective", "loads"))
+            raise Refusal(f"expected arrays of {what} [[joints]]", "objective.loads")
 
     def _check_load_cases(self, scene: Scene) -> None:
         horizon = scene.motion.horizon
@@ -264,8 +264,8 @@ class Objective(Table):
             raise Refusal(
                 f"expected at most {most}: one for each millisecond of motion.horizon = {horizon} "
                 f"[s], {MANY_CASES} of a shorter motion",
-                ("objective", "load_cases"),
-                ("motion", "horizon"),
+                "objective.load_cases",
+                "motion.horizon",
             )
 
     def _check_lightest(self, scene: Scene) -> None:
@@ -278,7 +278,7 @@ class Objective(Table):
             raise Refusal(
                 f"expected a limit under [constraints] with it, for example deviation: without "
                 f"one {least}",
-                ("objective", "kind"),
+                "objective.kind",
             )
 
     def _check_attached(self, scene: Scene) -> None:
@@ -289,8 +289,8 @@ class Objective(Table):
                 raise Refusal(
                     'expected more than 0 with objective.attached = "none": without a mass at its '
                     "end the optimiser would remove the end of an arm",
-                    ("arms", i, "passive"),
-                    ("objective", "attached"),
+                    f"arms.{i}.passive",
+                    "objective.attached",
                 )
 
 
@@ -342,39 +342,39 @@ class ConstraintOptions(Table):
             "tip_deflection": [scene.arms[i].name for i in scene.cell_counts],
         }
         for key, names in owners.items():
-            refuse_count(getattr(self, key), names, (*at, key))
+            refuse_count(getattr(self, key), names, f".{key}")
         for index, one in enumerate(vars(self)["stiffness"] or ()):
-            one.check_in_scene(scene, (*at, "stiffness", index))
-        self._check_delay(scene.motion, (*at, "settling_after"))
-        self._check_poles(scene, at)
-        self._check_arms(scene, at)
+            one.check_at(scene, (*at, "stiffness", index))
+        self._check_delay(scene.motion)
+        self._check_poles(scene)
+        self._check_arms(scene)
 
-    def _check_arms(self, scene: Scene, at: Loc) -> None:
+    def _check_arms(self, scene: Scene) -> None:
         """Refuse responses of flexible arms where there are none."""
         for one in asked(scene) if not scene.cell_counts else ():
             if one.of_arms:
-                where = (*at, one.key) if one.key in self.limits else ("objective", "kind")
+                where = f".{one.key}" if one.key in self.limits else "objective.kind"
                 raise Refusal("expected another response: no arm is flexible", where)
         for one in (one for one in asked(scene) if one.name == "stress"):
             for name, kind in scene.without_strength.items():
-                where = (*at, one.key) if one.key in self.limits else ("objective", "kind")
+                where = f".{one.key}" if one.key in self.limits else "objective.kind"
                 raise Refusal(
                     f"expected another response: {name} is {kind}, and no strength criterion is "
                     "known for that; limit deviation or buckling",
                     where,
                 )
 
-    def _check_poles(self, scene: Scene, at: Loc) -> None:
+    def _check_poles(self, scene: Scene) -> None:
         """Refuse responses of poles without a closed loop, and options of none."""
         used = [one.name for one in asked(scene) if "poles_at" in one.options]
         options = ("damping_below", "poles_at")
         for key in unused_options(options, scene.objective.kind, self.limits):
             if getattr(self, key) is not None:
                 users = " or ".join(f"constraints.{name}" for name in users_of(key)[1])
-                raise Refusal(f"expected none without {users}: nothing else uses it", (*at, key))
+                raise Refusal(f"expected none without {users}: nothing else uses it", f".{key}")
         if not used:
             return
-        where = (*at, used[0]) if used[0] in self.limits else ("objective", "kind")
+        where = f".{used[0]}" if used[0] in self.limits else "objective.kind"
         if scene.control is None:
             raise Refusal(
                 "expected another response without [control]: poles are those of the closed loop; "
@@ -386,28 +386,28 @@ class ConstraintOptions(Table):
         if sorted(set(instants)) != list(instants) or not instants or instants[-1] > horizon:
             raise Refusal(
                 f"expected ascending instants up to motion.horizon = {horizon:g} [s]",
-                (*at, "poles_at"),
-                ("motion", "horizon"),
+                ".poles_at",
+                "motion.horizon",
             )
 
-    def _check_delay(self, motion: Motion, own: Loc) -> None:
+    def _check_delay(self, motion: Motion) -> None:
         """Refuse a delay that leaves nothing of a rest."""
         left, delay = motion.horizon - motion.duration, self.settling_after
         if delay > max(left, 0.0):
             raise Refusal(
                 f"expected at most {left:.6g} [s], from motion.duration = {motion.duration:g} to "
                 f"motion.horizon = {motion.horizon:g}; shorten it or simulate longer",
-                own,
-                ("motion", "horizon"),
-                ("motion", "duration"),
+                ".settling_after",
+                "motion.horizon",
+                "motion.duration",
             )
         for start, end in motion.stated_dwells:
             if end - start <= delay:
                 raise Refusal(
                     f"expected dwells longer than constraints.settling_after = {delay:g} [s], "
                     f"found {shown([start, end])}; lengthen the dwell or shorten the delay",
-                    ("motion", "dwells"),
-                    own,
+                    "motion.dwells",
+                    ".settling_after",
                 )
 
 
@@ -502,5 +502,5 @@ class Scenario(Table):
                 raise Refusal(
                     f"expected of the material {' or '.join(allowed)} alone: the reduced basis "
                     "depends on the others",
-                    (*at, "changes"),
+                    ".changes",
                 )

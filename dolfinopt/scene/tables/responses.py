@@ -80,9 +80,7 @@ class StiffnessCase(Table):
         """Refuse what is no arm with a design, no load on it, or without limit."""
         names = [arm.name for arm in scene.arms if arm.flexible]
         if self.arm not in names:
-            raise Refusal(
-                f"expected the name of an arm with a design: {', '.join(names)}", (*at, "arm")
-            )
+            raise Refusal(f"expected the name of an arm with a design: {', '.join(names)}", ".arm")
         if self.displacement is None and self.rotation is None:
             raise Refusal("expected displacement or rotation, or both", at)
         if not any(self.load):
