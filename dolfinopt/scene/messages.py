@@ -64,7 +64,7 @@ def first_problem(
     places = [(problem.kind, problem.locs) for problem in problems]
     problems = [one for i, one in enumerate(problems) if places[i] not in places[:i]]
     known = {(problem.kind, problem.locs) for problem in problems}
-    problems = [problem for problem in problems if not _is_echo(problem, inherited, known)]
+    problems = [problem for problem in problems if not _is_echo(problem, tree, inherited, known)]
     # A misspelt key is also a missing one: the spelling is the message that helps.
     problems.sort(key=lambda problem: problem.kind != "unknown")
     first, n_more = problems[0], len(problems) - 1
@@ -83,13 +83,18 @@ def blamed(source: str, changes: list[Override], locs: tuple[Loc, ...]) -> str:
 
 
 def _is_echo(
-    problem: _Problem, inherited: set[Loc], known: set[tuple[str, tuple[Loc, ...]]]
+    problem: _Problem,
+    tree: dict[str, Any],
+    inherited: set[Loc],
+    known: set[tuple[str, tuple[Loc, ...]]],
 ) -> bool:
     """Tell whether the arm before has the same problem and this one only took it over."""
     before = []
     for loc in problem.locs:
-        taken = loc[:3] in inherited or (problem.kind == "missing" and loc[-1] != "name")
-        if loc[0] != "arms" or len(loc) < 3 or not taken:
+        if loc[0] != "arms" or len(loc) < 3:
+            return False
+        unstated = loc[2] not in tree["arms"][loc[1]] and loc[2] != "name"
+        if loc[:3] not in inherited and not unstated:
             return False
         before.append(("arms", loc[1] - 1, *loc[2:]))
     return (problem.kind, tuple(before)) in known

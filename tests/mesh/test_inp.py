@@ -241,7 +241,7 @@ def test_what_is_missing_is_told(folder) -> None:
         ({"interfaces": (BEGIN | {"axis": None}, END)}, ["expected those of the bore"]),
         ({"cell_shape": None}, ["tetrahedron", ".inp"]),
         ({"mesh": None, "cells": (20, 4), "cell_shape": None, "mesh_scale": 0.001},
-         ["only with mesh"]),
+         ["the default, without mesh"]),
     ],
 )  # fmt: skip
 def test_keys_that_do_not_fit(folder, keys, words) -> None:

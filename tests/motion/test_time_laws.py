@@ -198,14 +198,14 @@ def test_duration_follows_from_the_limits() -> None:
     ("motion", "words"),
     [
         ({"law": "trapezoidal", "max_jerk": 9.0},
-         ["motion.max_jerk = 9.0", 'none with motion.law = "trapezoidal"']),
+         ["motion.max_jerk = 9.0", 'none with law = "trapezoidal"']),
         ({"law": "s-curve", "max_jerk": 9.0, "acceleration_share": 0.3},
          ["motion.acceleration_share = 0.3", "0.25, the default", "motion.max_jerk"]),
         ({"duration": 2.5, "horizon": 2.0}, ["motion.horizon = 2.0", "motion.duration"]),
         ({"law": "trapezoidal", "max_speed": 2.0, "max_acceleration": 5.0, "duration": 1.9},
          ["motion.duration = 1.9", "at least"]),
         ({"path": "joints", "file": str(TWO_ARM), "max_speed": 1.0},
-         ["max_speed", 'none with motion.path = "joints"']),
+         ["max_speed", 'none with path = "joints"']),
     ],
 )  # fmt: skip
 def test_values_that_do_not_go_together(motion: dict[str, Any], words: list[str]) -> None:

@@ -19,6 +19,7 @@ from dolfinopt.scene.tables.base import (
     Position,
     Refusal,
     Table,
+    Use,
     shown,
     table_in,
 )
@@ -148,6 +149,12 @@ def check_arm_name(name: str) -> str:
 
 class Arm(Table):
     """One flexible arm; a key left out in a scene is taken from the arm before."""
+
+    USES = (
+        Use("wall min_wall max_wall ribs", "hollow"),
+        Use("mass inertia centre", "rigid"),
+        Use("mesh_size cell_shape mesh_scale", "mesh"),
+    )
 
     name: Annotated[str, AfterValidator(check_arm_name)] = Field(
         description="unique name, used in files and messages [-]"
@@ -343,12 +350,7 @@ class Arm(Table):
 
     @model_validator(mode="after")
     def _check_hollow(self) -> Arm:
-        if not self.hollow:
-            for key in WALL_KEYS:
-                if getattr(self, key) is not None:
-                    raise Refusal("expected only with hollow = true", key)
-            return self
-        if not self.flexible:
+        if not self.hollow or not self.flexible:
             return self
         if self.cells is None or len(self.cells) != 3:
             raise Refusal(
@@ -448,9 +450,6 @@ class Arm(Table):
 
     @model_validator(mode="after")
     def _check_joint(self) -> Arm:
-        for key in ("mass", "inertia", "centre"):
-            if getattr(self, key) is not None and not self.rigid:
-                raise Refusal("expected only with rigid = true", key, "rigid")
         check_parts(self, "arms")
         return self
 
@@ -495,9 +494,8 @@ class Arm(Table):
     def _check_mesh(self) -> Arm:
         check_bores(self)
         if self.mesh is None:
-            for key in (*SIZE_KEYS, "mesh_scale", *["interface_offset"] * (self.hull is None)):
-                if getattr(self, key) != Arm.model_fields[key].default:
-                    raise Refusal("expected only with mesh; a rectangular arm has cells", key)
+            if self.hull is None:
+                self.refuse_stated("interface_offset", "without mesh: an arm of cells has no file")
             return self
         if self.mesh_scale != 1.0 and Path(self.mesh).suffix.lower() in STEP_FILES:
             raise Refusal("expected none: a STEP file states its unit", "mesh_scale", "mesh")

@@ -6,7 +6,17 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from types import UnionType
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union, get_args, get_origin
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    NamedTuple,
+    Union,
+    get_args,
+    get_origin,
+)
 
 from pydantic import (
     BaseModel,
@@ -15,6 +25,7 @@ from pydantic import (
     ValidationError,
     ValidationInfo,
     field_validator,
+    model_validator,
 )
 
 from dolfinopt.errors import InputError
@@ -64,8 +75,24 @@ def loc_of(path: str | Loc) -> Loc:
     return tuple(int(part) if part.isdigit() else part for part in path.split("."))
 
 
+class Use(NamedTuple):
+    """Keys of a table that have an effect with some values of another one alone.
+
+    Attributes:
+        keys: which, separated by spaces.
+        choice: the other one.
+        values: of that, separated by spaces; "": any but none, false and 0.
+    """
+
+    keys: str
+    choice: str
+    values: str = ""
+
+
 class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
+
+    USES: ClassVar[tuple[Use, ...]] = ()
 
     # Validators are built at first use, once for the whole scene, not when a table is imported.
     model_config = ConfigDict(
@@ -111,15 +138,25 @@ class Table(BaseModel):
         except Refusal as refusal:
             raise refusal.below(at) from None
 
-    def refuse_unused(self, used: bool, choice: str, *keys: str) -> None:
-        """Raise unless `keys` have their defaults, or are `used` with this value of `choice`."""
-        for key in keys:
-            default = type(self).model_fields[key].default
-            if used or getattr(self, key) == default:
+    @model_validator(mode="after")
+    def _check_uses(self) -> Self:
+        for use in self.USES:
+            choice = getattr(self, use.choice)
+            if choice in use.values.split() if use.values else choice:
                 continue
+            found = f"with {use.choice} = {shown(choice)}, which does not use it"
+            if choice is None:
+                found = f"without {use.choice}"
+            for key in use.keys.split():
+                self.refuse_stated(key, found, use.choice)
+        return self
+
+    def refuse_stated(self, key: str, reason: str, *others: str) -> None:
+        """Raise if a key has not its default; `reason` goes on after "expected none"."""
+        default = type(self).model_fields[key].default
+        if getattr(self, key) != default:
             expected = "none" if default is None else f"{shown(default)}, the default,"
-            found = f"{type(self).__name__.lower()}.{choice} = {shown(getattr(self, choice))}"
-            raise Refusal(f"expected {expected} with {found}, which does not use it", key, choice)
+            raise Refusal(f"expected {expected} {reason}", key, *others)
 
     @field_validator("*", mode="before")
     @classmethod

@@ -14,6 +14,7 @@ from dolfinopt.scene.tables.base import (
     Position,
     Refusal,
     Table,
+    Use,
     input_error,
 )
 from dolfinopt.scene.tables.joints import (
@@ -56,6 +57,14 @@ IN_SPACE: dict[str, Parts] = {
 
 class Closures(Table):
     """A joint between an arm's interface and another one or the ground that closes a loop."""
+
+    USES = (
+        Use("length stiffness damping", "kind", "rod"),
+        Use("cross_axis", "kind", "universal"),
+        Use("axis", "kind", "pin slider universal"),
+        Use("rpy", "kind", "ball pin slider universal"),
+        Use("damping", "stiffness"),
+    )
 
     name: Annotated[str, AfterValidator(check_joint_name)] = Field(
         description="unique name; of a rod without length the column of its length in tables [-]"
@@ -129,11 +138,6 @@ class Closures(Table):
 
     @model_validator(mode="after")
     def _check_kind(self) -> Closures:
-        self.refuse_unused(self.kind == "rod", "kind", "length", "stiffness", "damping")
-        self.refuse_unused(self.kind == "universal", "kind", "cross_axis")
-        self.refuse_unused(self.kind in ("pin", "slider", "universal"), "kind", "axis")
-        self.refuse_unused(self.kind != "rod", "kind", "rpy")
-        self.refuse_unused(self.is_spring, "stiffness", "damping")
         needed = {"slider": ("axis",), "universal": ("axis", "cross_axis")}
         for key in needed.get(self.kind, ()):
             if getattr(self, key) is None:

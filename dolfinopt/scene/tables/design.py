@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, model_validator
 
-from dolfinopt.scene.tables.base import MAX_ITERATIONS, Length, Loc, Position, Refusal, Table, shown
+from dolfinopt.scene.tables.base import (
+    MAX_ITERATIONS,
+    Length,
+    Loc,
+    Position,
+    Refusal,
+    Table,
+    Use,
+    shown,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -23,6 +32,12 @@ MEMBER_CELLS = 3  # in the width of the thinnest member: with fewer one cell mor
 
 class Design(Table):
     """Design variables x of all cells, their limits and their filter."""
+
+    USES = (
+        Use("sharpness continuation", "projection"),
+        Use("erosion limits_on minimum_member minimum_gap", "projection", "robust"),
+        Use("shared_volume", "volume_fraction"),
+    )
 
     volume_fraction: float | None = Field(
         default=0.5,
@@ -153,13 +168,6 @@ class Design(Table):
         if not (stated := self.stated_widths):
             return self
         key = next(iter(stated))
-        if self.projection != "robust":
-            raise Refusal(
-                'expected 0, the default, unless design.projection = "robust": the others do not '
-                "control the width",
-                key,
-                "projection",
-            )
         # The width that `WIDEST` gives, in widths of `erosion`.
         ratio = math.acosh(1.0 / (1.0 - 2.0 * WIDEST)) / math.acosh(
             1.0 / (1.0 - 2.0 * self.erosion)
@@ -183,15 +191,6 @@ class Design(Table):
                 "filter_radius",
                 key,
             )
-        return self
-
-    @model_validator(mode="after")
-    def _check_unused(self) -> Design:
-        projected = self.projection is not False
-        self.refuse_unused(projected, "projection", "sharpness", "continuation")
-        self.refuse_unused(self.projection == "robust", "projection", "erosion")
-        self.refuse_unused(self.projection == "robust", "projection", "limits_on")
-        self.refuse_unused(self.volume_fraction is not None, "volume_fraction", "shared_volume")
         return self
 
     @model_validator(mode="after")

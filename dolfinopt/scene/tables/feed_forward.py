@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from dolfinopt.scene.tables.base import Duration, Loc, Refusal, Table, shown
+from dolfinopt.scene.tables.base import Duration, Loc, Refusal, Table, Use, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -16,6 +16,8 @@ LEAD_SHARE = 0.05  # of the motion's duration: pre-actuation fades within millis
 
 class FeedForward(Table):
     """Corrections of joints that keep the tip of the flexible machine on the rigid one's path."""
+
+    USES = (Use("joints spacing lead", "kind", "tip"),)
 
     kind: Literal["none", "tip"] = Field(
         default="none",
@@ -47,9 +49,6 @@ class FeedForward(Table):
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what nothing uses, joints that are no drives, and motions without a free tip."""
         if not self.on:
-            for key in ("joints", "spacing", "lead"):
-                if getattr(self, key) is not None:
-                    raise Refusal('expected none without feed_forward.kind = "tip"', f".{key}")
             return
         if scene.control is not None and scene.control.feed_forward != "tip":
             raise Refusal(

@@ -7,7 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from dolfinopt.scene.tables.arms import Moment, Tensor, check_arm_name, tensor_problem
-from dolfinopt.scene.tables.base import FileName, Loc, Position, Refusal, Table, refuse_count, shown
+from dolfinopt.scene.tables.base import (
+    FileName,
+    Loc,
+    Position,
+    Refusal,
+    Table,
+    Use,
+    refuse_count,
+    shown,
+)
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
     FRICTION_SPEED,
@@ -26,7 +35,6 @@ from dolfinopt.scene.tables.joints import (
     check_used,
     joint_parts,
     site_of,
-    stated_at,
 )
 
 if TYPE_CHECKING:
@@ -38,7 +46,9 @@ Direction = Annotated[tuple[Component, Component, Component], AfterValidator(che
 Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # m, rad
 Limit = Annotated[float, Field(ge=1e-9, le=1e15)]  # rad/s, m/s; N m, N
-LIMITS = ("position_limits", "velocity_limit", "effort_limit")
+# What fixed joints do not have.
+OF_MOVING = ("axis", "passive", "position_limits", "velocity_limit", "effort_limit",
+             *(key for key in DRIVE_KEYS if key not in OF_BEARINGS))  # fmt: skip
 GROUND = "ground"
 PATHS = ("joints", "points", "line")  # of machines in space
 # What a machine in the plane has instead of joints.
@@ -54,6 +64,8 @@ def check_joint_name(name: str) -> str:
 
 class Joint(Table):
     """A joint between the ground or an arm's outboard interface and the arm that it holds."""
+
+    USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"),)
 
     name: Annotated[str, AfterValidator(check_joint_name)] = Field(
         description="unique name, the column of its coordinate in tables [-]"
@@ -121,18 +133,12 @@ class Joint(Table):
 
     @model_validator(mode="after")
     def _check_limits(self) -> Joint:
-        for key in LIMITS:
-            if getattr(self, key) is not None and not self.moves:
-                raise Refusal("expected none with a fixed joint", key, "type")
         if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
             raise Refusal("expected the least first, then the largest", "position_limits")
         return self
 
     @model_validator(mode="after")
     def _check_parts(self) -> Joint:
-        for key in DRIVE_KEYS if not self.moves else ():
-            if key not in OF_BEARINGS and stated_at(self, key):
-                raise Refusal("expected none with a fixed joint", key, "type")
         check_parts(self, "joints")
         return self
 
@@ -142,8 +148,6 @@ class Joint(Table):
             raise Refusal(
                 f"expected an array of three numbers with a {self.type} joint", "axis", "type"
             )
-        if self.axis is not None and not self.moves:
-            raise Refusal("expected none with a fixed joint", "axis", "type")
         return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
@@ -205,8 +209,6 @@ def _check_passive(scene: Scene) -> None:
     """Refuse joints without drives where no loop moves them."""
     for i, joint in enumerate(scene.joints):
         at = f"joints.{i}.passive"
-        if joint.passive and not joint.moves:
-            raise Refusal("expected none with a fixed joint", at, f"joints.{i}.type")
         if joint.passive and not scene.closures:
             raise Refusal(
                 "expected false, the default, without [[closures]]: no loop moves the joint", at

@@ -16,7 +16,7 @@ from dolfinopt.scene.tables.base import (
     Position,
     Refusal,
     Table,
-    shown,
+    Use,
 )
 
 if TYPE_CHECKING:
@@ -45,6 +45,19 @@ OF_PATH = "path_speed", "path_acceleration", "path_jerk"  # limits of a law with
 
 class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
+
+    USES = (
+        Use("radius flattening", "path", "arc"),
+        Use("start end rpy", "path", "line"),
+        Use("initial_joints", "path", "line points joints rotation"),
+        Use("file table_ends", "path", "points joints"),
+        Use("speed start_angle", "path", "rotation"),
+        Use("cart_follow elbow max_speed max_acceleration max_jerk", "path", "arc line points"),
+        Use("cart_follow cart_mass", "base", "cart"),
+        Use("base_position", "base", "fixed"),
+        Use("acceleration_share", "law", "trapezoidal s-curve"),
+        Use("max_jerk", "law", "quintic septic s-curve"),
+    )
 
     path: PathKind = Field(
         description="path of the end-effector (arc, line, table of points), a table of joint "
@@ -178,36 +191,18 @@ class Motion(Table):
             )
         if self.path == "line" and self.start == self.end:
             raise Refusal("expected another point than motion.start", "end", "start")
-        self.refuse_unused(self.path == "arc", "path", "radius", "flattening")
-        self.refuse_unused(self.path == "line", "path", "start", "end", "rpy")
-        self.refuse_unused(self.path != "arc", "path", "initial_joints")
-        self.refuse_unused(tabulated, "path", "file")
-        self.refuse_unused(self.path == "rotation", "path", "speed", "start_angle")
-        self.refuse_unused(tabulated, "path", "table_ends")
-        joints = self.path in ("joints", "rotation")
-        self.refuse_unused(not joints, "path", "cart_follow", "elbow")
         if self.path == "rotation" and self.base != "fixed":
             raise Refusal('expected "fixed" with motion.path = "rotation"', "base", "path")
-        self.refuse_unused(self.base == "cart", "base", "cart_follow", "cart_mass")
-        self.refuse_unused(self.base == "fixed", "base", "base_position")
         self._check_law()
         return self
 
     def _check_law(self) -> None:
         """Raise where the law does not use a limit, or the path ends behind the horizon."""
         profile = self.law in ("trapezoidal", "s-curve")
-        self.refuse_unused(profile, "law", "acceleration_share")
-        self.refuse_unused(self.law != "trapezoidal", "law", "max_jerk")
-        self.refuse_unused(self.path not in ("joints", "rotation"), "path", *LIMITS)
         last = "max_jerk" if self.law == "s-curve" else "max_acceleration"
-        share = type(self).model_fields["acceleration_share"].default
-        if profile and getattr(self, last) is not None and self.acceleration_share != share:
-            raise Refusal(
-                f"expected {shown(share)}, the default, with motion.{last}, which determines "
-                "how long the law accelerates",
-                "acceleration_share",
-                last,
-            )
+        if profile and getattr(self, last) is not None:
+            reason = f"with motion.{last}, which determines how long the law accelerates"
+            self.refuse_stated("acceleration_share", reason, last)
         if self.horizon < self.duration:
             raise Refusal(
                 f"expected at least motion.duration = {self.duration:g} [s], the end of the path",
@@ -421,6 +416,11 @@ Coordinates = Annotated[int, Field(ge=1)] | Literal["auto"]
 class Reduction(Table):
     """Model reduction of every arm."""
 
+    USES = (
+        Use("frequencies", "method", "krylov balanced"),
+        Use("tolerance", "coordinates", "auto"),
+    )
+
     method: ReductionMethod = Field(
         default="craig-bampton", description="method of model reduction [-]"
     )
@@ -453,7 +453,6 @@ class Reduction(Table):
 
     @model_validator(mode="after")
     def _check_frequencies(self) -> Reduction:
-        self.refuse_unused(self.method in ("krylov", "balanced"), "method", "frequencies")
         given = self.frequencies
         if given is None:
             return self
@@ -497,11 +496,6 @@ class Reduction(Table):
         if self.fewest == 1 or not (arm.flexible and arm.is_solid):
             return self.fewest
         return self.fewest // 3 * arm.num_outboard
-
-    @model_validator(mode="after")
-    def _check_unused(self) -> Reduction:
-        self.refuse_unused(self.coordinates == "auto", "coordinates", "tolerance")
-        return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse more coordinates than an arm has dofs, and undamped resonances in a Gramian."""
