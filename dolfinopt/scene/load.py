@@ -13,6 +13,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_origin
 
@@ -31,11 +32,13 @@ from dolfinopt.scene.messages import (
     dotted,
     field_at,
     first_problem,
+    misplaced,
     model_at,
     unknown_key,
+    wrong_value,
 )
 from dolfinopt.scene.old_words import OLD_KEYS, read_old_words, rows, scaled
-from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name, file_in
+from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name, named_files
 from dolfinopt.scene.tables.arms import (
     MAX_ARMS,
     MAX_CELLS,
@@ -49,7 +52,16 @@ from dolfinopt.scene.tables.arms import (
     WALL_KEYS,
     Arm,
 )
-from dolfinopt.scene.tables.base import Loc, Refusal, Table, cut, input_error, shown, without_none
+from dolfinopt.scene.tables.base import (
+    Loc,
+    Refusal,
+    Table,
+    cut,
+    input_error,
+    loc_of,
+    shown,
+    without_none,
+)
 from dolfinopt.scene.tables.closures import (
     OLD,
     OLD_CLOSURE,
@@ -136,14 +148,13 @@ def _default_name(source: str) -> str:
 
 def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name: str) -> Scene:
     """Complete `data`, apply `overrides`, validate; `name` is the default of the scene's name."""
-    arms = data.get("arms")
-    if isinstance(arms, list) and len(arms) > MAX_ARMS:
-        raise input_error(source, f"arms: {len(arms)} of them, expected at most {MAX_ARMS}")
     tree = _copy_tables(data)
     tree.setdefault("name", name)
     tree.setdefault("material", {})  # so that the message names the first key missing in it
-    _name_material(tree)
     read_old_closure(tree, source)
+    _check_tables(tree, source)
+    if (count := len(tree.get("arms") or ())) > MAX_ARMS:
+        raise input_error(source, f"arms: {count} of them, expected at most {MAX_ARMS}")
     told = read_old_words(tree, source)
     inherited = _inherit(tree, [key for key in Arm.model_fields if key not in OWN_KEYS])
     sizes = {loc for loc in inherited if loc[2] in SIZE_KEYS}
@@ -152,6 +163,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
         sizes.difference_update(change.locs)
         inherited.difference_update(change.locs[:1])
         inherited.update(change.locs[1:])
+    _check_tables(tree, source, changes)
     told += read_old_words(tree, source, anew=True)
     # An override may have supplied what the first arm lacked; otherwise it changes what it names.
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
@@ -189,17 +201,18 @@ def pose_scenarios(scene: Scene) -> tuple[Scene, ...]:
     return tuple(scene_from_dict(plain, scene.source, one.changes) for one in scene.scenarios)
 
 
-def _name_material(tree: dict[str, Any]) -> None:
-    """Make a name in place of the table [material] a key of the table."""
+def _check_tables(tree: dict[str, Any], source: str, changes: Sequence[Override] = ()) -> None:
+    """Refuse what is no table where a scene has one; a name is one in place of [material]."""
     if isinstance(tree.get("material"), str):
         tree["material"] = {"name": tree["material"]}
+    for loc in misplaced(tree):
+        raise input_error(blamed(source, changes, (loc,)), wrong_value(loc, tree))
 
 
 def _fill_material(tree: dict[str, Any], source: str, changes: list[Override]) -> None:
     """Complete [material] by the catalogue where it names one."""
-    _name_material(tree)
-    material = tree.get("material")
-    if not isinstance(material, dict) or not isinstance(name := material.get("name"), str):
+    material = tree["material"]
+    if not isinstance(name := material.get("name"), str):
         return
     if name not in CATALOGUE:
         where = blamed(source, changes, (("material", "name"),))
@@ -209,18 +222,10 @@ def _fill_material(tree: dict[str, Any], source: str, changes: list[Override]) -
 
 def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -> None:
     """Put absolute paths in place of the files that `tree` names."""
-    # What is no string and keys that a table does not have are left for validation to refuse.
-    for table, key in FILE_KEYS:
-        model, node = model_at((table,)), tree.get(table)
-        if model is None or key not in model.model_fields:
-            continue
-        for i, row in enumerate(node if isinstance(node, list) else [node]):
-            value = row.get(key) if isinstance(row, dict) else None
-            if not isinstance(value, str) or not file_in(key, value):
-                continue
-            loc = (table, i, key) if isinstance(node, list) else (table, key)
-            where = blamed(source, changes, (loc,))
-            row[key] = resolve_file(source, value, dotted(loc, tree), where)
+    for name, row, key in named_files(tree):
+        loc = loc_of(name)
+        where = blamed(source, changes, (loc,))
+        row[key] = resolve_file(source, row[key], dotted(loc, tree), where)
 
 
 def _drop_sizes(tree: dict[str, Any], sizes: set[Loc]) -> None:
@@ -228,7 +233,7 @@ def _drop_sizes(tree: dict[str, Any], sizes: set[Loc]) -> None:
     # A .msh file has its cells; a .geo file in the plane a size only where it has the parameter.
     for table, i, key in sizes:
         arm = tree[table][i]
-        if not isinstance(arm, dict) or not isinstance(mesh := arm.get("mesh"), str):
+        if not isinstance(mesh := arm.get("mesh"), str):
             continue
         kind, solid = Path(mesh).suffix.lower(), arm.get("cell_shape") in SOLID_SHAPES
         meshed = kind in (".msh", ".inp") and not (solid and key == "cell_shape")
@@ -241,9 +246,8 @@ def _drop_sizes(tree: dict[str, Any], sizes: set[Loc]) -> None:
 def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
     """Take the length of arms with standard input data from their files, unless it is stated."""
     # Height and thickness are only drawn then: a twentieth of the length unless stated.
-    arms = tree.get("arms")
-    for i, arm in enumerate(arms if isinstance(arms, list) else []):
-        if not isinstance(arm, dict) or not isinstance(arm.get("sid"), str):
+    for i, arm in enumerate(rows(tree, "arms")):
+        if not isinstance(arm.get("sid"), str):
             continue
         from dolfinopt.scene.sid import read_sid  # NumPy, which other scenes do not need
 
@@ -266,10 +270,9 @@ def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
 
 def _share_interfaces(tree: dict[str, Any]) -> None:
     """Give arms that share another's design its interfaces, which are part of the mesh."""
-    arms = tree.get("arms")
-    known = [arm for arm in arms if isinstance(arm, dict)] if isinstance(arms, list) else []
-    for arm in known:
-        for other in known if "design" in arm and "interfaces" not in arm else ():
+    arms = rows(tree, "arms")
+    for arm in arms:
+        for other in arms if "design" in arm and "interfaces" not in arm else ():
             if other.get("name") == arm["design"] and "interfaces" in other:
                 arm["interfaces"] = _copied(other["interfaces"])
 
@@ -277,11 +280,8 @@ def _share_interfaces(tree: dict[str, Any]) -> None:
 def _size_rigid(tree: dict[str, Any]) -> None:
     """Give rigid arms in space that state their inertia a size to be drawn with."""
     # A point has no inertia to state; of other arms mass and inertia would follow from the size.
-    arms = tree.get("arms")
-    if not tree.get("joints") or not isinstance(arms, list):
-        return
-    for arm in arms:
-        if not isinstance(arm, dict) or arm.get("rigid") is not True:
+    for arm in rows(tree, "arms") if tree.get("joints") else ():
+        if arm.get("rigid") is not True:
             continue
         length = arm.get("length")
         point = length in (0, 0.0) and not arm.get("mass")
@@ -377,15 +377,9 @@ def _copied(value: Any) -> Any:
 
 def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
     """Fill each arm's missing `keys` from the arm before; return their paths."""
-    arms = tree.get("arms")
     inherited: set[Loc] = set()
-    if not isinstance(arms, list):
-        return inherited
     fixed = [one.get("child") for one in rows(tree, "joints") if one.get("type") == "fixed"]
-    for i in range(1, len(arms)):
-        before, arm = arms[i - 1], arms[i]
-        if not (isinstance(before, dict) and isinstance(arm, dict)):
-            continue
+    for i, (before, arm) in enumerate(pairwise(rows(tree, "arms")), start=1):
         taken = {key for keys in _replaced(arm) for key in keys}
         if arm.get("name") in fixed:
             taken.update(key for key in DRIVE_KEYS if key not in OF_BEARINGS)
@@ -400,15 +394,13 @@ def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
 
 def _take_bores(before: Mapping[str, Any], arm: dict[str, Any]) -> None:
     """Give an arm with the mesh of the arm before the bores at its ends, too."""
-    others = before.get("interfaces")
-    ends = [one for one in others or () if isinstance(one, dict) and _is_end(one)]
-    if isinstance(others, list) and ends and not any(map(_is_end, arm.get("interfaces") or ())):
-        arm["interfaces"] = [*_copied(ends), *(arm.get("interfaces") or ())]
+    ends, own = list(filter(_is_end, rows(before, "interfaces"))), rows(arm, "interfaces")
+    if ends and not any(map(_is_end, own)):
+        arm["interfaces"] = [*_copied(ends), *own]
 
 
-def _is_end(row: Any) -> bool:
-    name = row.get("name") if isinstance(row, Mapping) else None
-    return str(name).strip().casefold() in (INBOARD, OUTBOARD)
+def _is_end(row: Mapping[str, Any]) -> bool:
+    return str(row.get("name")).strip().casefold() in (INBOARD, OUTBOARD)
 
 
 def _replaced(arm: Mapping[str, Any]) -> Iterator[Sequence[str]]:
@@ -446,6 +438,7 @@ def _override(tree: dict[str, Any], text: str, source: str) -> Override:
         return Override(text, (parts,))
     locs = _override_locs(tree, parts, where)
     for loc in locs:
+        _check_tables(tree, source)
         if loc[0] == "arms" and loc[2:] in (("cells",), ("mesh",)):
             _drop_mesh(tree, loc)
         if loc == ("material", "name") or (loc[0] == "arms" and loc[2:] == ("material",)):
@@ -473,17 +466,14 @@ def _is_old(loc: Loc) -> bool:
 
 def _drop_mesh(tree: dict[str, Any], loc: Loc) -> None:
     """Let `cells` or `mesh` at `loc` take the place of what the arm is meshed from so far."""
-    arm = tree["arms"][loc[1]]
-    if not isinstance(arm, dict):
-        return
     for key in MESH_KEYS if loc[2] == "cells" else ("cells",):
-        arm.pop(key, None)
+        tree["arms"][loc[1]].pop(key, None)
 
 
 def _drop_values(tree: dict[str, Any], loc: Loc) -> None:
     """Let the name of a material at `loc` take the place of the values stated so far."""
     table = tree["arms"][loc[1]] if loc[0] == "arms" else tree["material"]
-    for key in material_keys() if isinstance(table, dict) else ():
+    for key in material_keys():
         table.pop(key, None)
 
 
@@ -501,10 +491,7 @@ def _override_locs(tree: dict[str, Any], parts: tuple[str, ...], where: str) -> 
     locs: tuple[Loc, ...] = (parts,)
     table = parts[0]
     if table in NAMED and len(parts) > 1 and (table in tree or table == "arms"):
-        members = tree.get(table)
-        if not isinstance(members, list):  # validation will say so
-            return ()
-        fields = NAMED[table].model_fields
+        members, fields = rows(tree, table), NAMED[table].model_fields
         if len(parts) == 2 and (parts[1] in fields or _is_old(parts)):
             locs = tuple((table, i, parts[1]) for i in range(len(members)))
         else:
@@ -543,15 +530,11 @@ def _is_array(loc: Loc) -> bool:
 
 
 def _store(tree: dict[str, Any], loc: Loc, value: Any) -> None:
-    """Set the value at `loc`; do nothing where the file has no table, which validation reports."""
+    """Set the value at `loc`, in tables that are made where there are none."""
     node: Any = tree
     for part in loc[:-1]:
-        if isinstance(node, dict):
-            node = node.setdefault(part, {})
-        elif isinstance(node, list) and isinstance(part, int):
-            node = node[part]
-    if isinstance(node, dict) or (isinstance(node, list) and isinstance(loc[-1], int)):
-        node[loc[-1]] = value
+        node = node.setdefault(part, {}) if isinstance(node, dict) else node[part]
+    node[loc[-1]] = value
 
 
 # -- values of a scene that are not stated and follow from others --------------------------------
@@ -579,19 +562,14 @@ SHOULDER, ARC = -0.25, 0.5  # place of the shoulder and radius of the arc over t
 
 def _measure_path(tree: dict[str, Any]) -> Keys:
     """Complete the lengths of path and filter from the arms'; return their (table, key)."""
-    arms = tree.get("arms")
-    rows = [arm for arm in arms if isinstance(arm, dict)] if isinstance(arms, list) else []
-    lengths, heights = (_sizes(rows, key) for key in ("length", "height"))
+    lengths, heights = (_sizes(rows(tree, "arms"), key) for key in ("length", "height"))
     motion, design = tree.get("motion"), tree.setdefault("design", {})
     found: dict[tuple[str, str], float] = {}
-    if isinstance(motion, dict) and lengths and not tree.get("joints"):
+    if motion and lengths and not tree.get("joints"):
         found["motion", "joint_height"] = SHOULDER * sum(lengths)
         if motion.get("path") == "arc":
             found["motion", "radius"] = ARC * sum(lengths)
-    widths = isinstance(design, dict) and (
-        design.get("minimum_member") or design.get("minimum_gap")
-    )
-    if isinstance(design, dict) and heights and not widths:
+    if heights and not (design.get("minimum_member") or design.get("minimum_gap")):
         found["design", "filter_radius"] = FILTERED * min(heights)
     derived = [key for key in found if key[1] not in tree[key[0]]]
     for table, key in derived:
@@ -607,33 +585,28 @@ def _sizes(arms: Iterable[Mapping[str, Any]], key: str) -> list[float]:
 
 def _count_coordinates(tree: dict[str, Any]) -> Keys:
     """Give solid arms six coordinates an interface; return (table, key) if it was not stated."""
-    reduction, arms = tree.get("reduction", {}), tree.get("arms")
-    if not (isinstance(reduction, dict) and isinstance(arms, list)):
-        return ()
-    usual = Reduction.model_fields["method"].default
+    reduction, usual = tree.get("reduction", {}), Reduction.model_fields["method"].default
     if "coordinates" in reduction or reduction.get("method", usual) != usual:
         return ()
-    counts = [6 * (1 + _length(arm.get("interfaces"))) for arm in arms if _is_solid(arm)]
+    solids = filter(_is_solid, rows(tree, "arms"))
+    counts = [6 * (1 + len(rows(arm, "interfaces"))) for arm in solids]
     if not counts:
         return ()
     tree["reduction"] = {**reduction, "coordinates": max(counts)}
     return (("reduction", "coordinates"),)
 
 
-def _is_solid(arm: Any) -> bool:
-    if not isinstance(arm, dict) or arm.get("rigid") is True or arm.get("sid") is not None:
+def _is_solid(arm: Mapping[str, Any]) -> bool:
+    if arm.get("rigid") is True or arm.get("sid") is not None:
         return False
-    return _length(arm.get("cells")) == 3 or arm.get("cell_shape") in SOLID_SHAPES
-
-
-def _length(value: Any) -> int:
-    return len(value) if isinstance(value, list | tuple) else 0
+    cells = arm.get("cells")
+    in_three = isinstance(cells, list | tuple) and len(cells) == 3
+    return in_three or arm.get("cell_shape") in SOLID_SHAPES
 
 
 def _time_motion(tree: dict[str, Any]) -> Keys:
     """Complete duration and horizon where they follow from others; return their (table, key)."""
-    motion = tree.get("motion")
-    if not isinstance(motion, dict):
+    if not (motion := tree.get("motion")):
         return ()
     asked = ("file", *LIMITS)
     derived: list[tuple[str, str]] = []
@@ -661,14 +634,11 @@ def _time_motion(tree: dict[str, Any]) -> Keys:
 
 def _limit_volume(tree: dict[str, Any]) -> Keys:
     """Leave out the volume's limit where mass is asked for; return (table, key) if not stated."""
-    tables = {key: tree.get(key) for key in ("design", "objective", "constraints")}
-    design, objective, limits = (one if isinstance(one, dict) else {} for one in tables.values())
+    design, limits = tree["design"], tree.get("constraints", {})
     if design.get("volume_fraction") is not None:
         return ()
     design.pop("volume_fraction", None)
-    if objective.get("kind") == "mass" or limits.get("mass") is not None:
-        if tables["design"] is None:
-            tree["design"] = design
+    if tree.get("objective", {}).get("kind") == "mass" or limits.get("mass") is not None:
         design["volume_fraction"] = None
     return (("design", "volume_fraction"),)
 
@@ -676,7 +646,7 @@ def _limit_volume(tree: dict[str, Any]) -> Keys:
 def _freeze_loads(tree: dict[str, Any]) -> Keys:
     """Hold the loads in the gradient of "esl" without limits of the motion; return (table, key)."""
     objective, limits = tree.get("objective", {}), tree.get("constraints", {})
-    if not (isinstance(objective, dict) and isinstance(limits, dict)) or "gradient" in objective:
+    if "gradient" in objective:
         return ()
     limited = [key for key, limit in limits.items() if limit is not None]
     if objective.get("kind", Objective.model_fields["kind"].default) != "esl" or any(

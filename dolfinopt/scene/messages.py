@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
@@ -73,7 +73,7 @@ def first_problem(
     return one_line(f"{where}: {first.text}{more}")
 
 
-def blamed(source: str, changes: list[Override], locs: tuple[Loc, ...]) -> str:
+def blamed(source: str, changes: Sequence[Override], locs: tuple[Loc, ...]) -> str:
     """Return the place to blame for the values at `locs`: the file, or the last --set of them."""
     where = source
     for change in changes:
@@ -118,12 +118,35 @@ def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
     if isinstance(reason, Refusal):
         locs = tuple((*loc, *key) for key in reason.keys) or (loc,)
         return _Problem(f"{_found(locs[0], tree)}: {reason.reason}", locs, "value")
-    field = field_at(loc)
-    allowed = allowed_words(field)
+    text = wrong_value(loc, tree)
     if item["type"] == "finite_number":
-        allowed = allowed.replace("number", "finite number")
-    text = f"{_found(loc, tree)}: expected {allowed} ({_meaning(field)})"
+        text = text.replace(" number", " finite number")
     return _Problem(text, (loc,), "value")
+
+
+def wrong_value(loc: Loc, tree: dict[str, Any]) -> str:
+    """Return the message for a value of another type or range than its key has."""
+    field = field_at(loc)
+    return f"{_found(loc, tree)}: expected {allowed_words(field)} ({_meaning(field)})"
+
+
+def misplaced(node: Mapping[str, Any], model: type[Table] = Scene, loc: Loc = ()) -> Iterator[Loc]:
+    """Yield where a scene's data has something else than its tables and arrays of them."""
+    for key, value in node.items():
+        field = model.model_fields.get(key)
+        table = table_in(field.annotation) if field else None
+        if field is None or table is None or value is None:
+            continue
+        array = get_origin(without_none(field.annotation)) is tuple
+        if array and not isinstance(value, list | tuple):
+            yield (*loc, key)
+            continue
+        for i, row in enumerate(value if array else [value]):
+            at = (*loc, key, i) if array else (*loc, key)
+            if isinstance(row, dict):
+                yield from misplaced(row, table, at)
+            else:
+                yield at
 
 
 def _key_loc(raw: Loc) -> Loc:
