@@ -70,8 +70,7 @@ def imported(folder: Path) -> Path:
         joints = [f"{name.strip()}_joint" for name in names.split(",")[1:]]  # the UR10's names
         motion.write_text("\n".join([",".join(["t", *joints]), *rows]) + "\n", encoding="utf-8")
     MPI.COMM_WORLD.barrier()
-    told = ["import", robot_file(), "--links", LINK, "--boxes", "--out", scene.parent,
-            "--trajectory", motion]  # fmt: skip
+    told = ["import", robot_file(), motion, LINK, "--boxes", "--out", scene.parent]
     commands.main([str(word) for word in told], standalone_mode=False, obj=MPI.COMM_WORLD)
     if MPI.COMM_WORLD.rank == 0:
         # A wall has no density to begin with, and its volume is what is minimised.

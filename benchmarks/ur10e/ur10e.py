@@ -47,8 +47,7 @@ def read_record(file: Path, first: int, last: int) -> tuple[RigidMotion, np.ndar
         table = np.empty(0)
     if table.ndim != 2 or len(table) != last - first + 1 or table.shape[1] < COLUMNS:
         raise InputError(
-            f"--records: {file}: expected a record of t, six angles, speeds and currents in "
-            f"{last} rows"
+            f"{file}: expected a record of t, six angles, speeds and currents in {last} rows"
         )
     t, q, qd, current = np.split(table[:, :COLUMNS], [1, 7, 13], axis=1)
 

@@ -111,7 +111,7 @@ def chosen_cases(names: Sequence[str], records: bool = False) -> tuple[Case, ...
             expected = " | ".join(["all", *known])
             raise InputError(f"bench field {name}: no such case; expected {expected}")
         if known[name].records and not records:
-            raise InputError(f"bench field {name}: give --records DIR, {known[name].records}")
+            raise InputError(f"bench field {name}: name it as {name}=DIR, {known[name].records}")
     return tuple(known[name] for name in dict.fromkeys(names))
 
 

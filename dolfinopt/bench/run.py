@@ -44,7 +44,7 @@ def bench(
 
     `tell` takes a line for every step, `done` one for every finished diagram.
     """
-    head = HEAD.format(" --quick" * plan.quick)
+    head = HEAD.format(" quick" * plan.quick)
     frames: dict[str, Frame] = {}
     parts, failures = [], []
     for k, diagram in enumerate(diagrams, 1):

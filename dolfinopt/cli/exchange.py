@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +17,7 @@ from dolfinopt.cli.shared import (
     claim,
     design_option,
     load,
+    old_option,
     out_option,
     overwrite_option,
     prepare,
@@ -106,7 +106,9 @@ def _export_state_space(
 ) -> None:
     """Write a scene's machine, or a run's, linearised at an instant, s."""
     if at is None:
-        raise InputError("--at: expected an instant, s, at which the machine is linearised")
+        raise InputError(
+            "state-space: expected an instant, s, behind it: export SCENE state-space T"
+        )
     folder = out or Path("results") / f"{source.stem}-state-space"
     if source.is_dir():
         if design is not None:
@@ -225,26 +227,17 @@ def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
 
 @click.command(name="import")
 @click.argument("robot", type=PATH)
-@click.option(
-    "--links", required=True, metavar="A,B", help="links that become solids to be optimised"
-)
-@click.option(
-    "--trajectory",
-    required=True,
-    type=PATH,
-    metavar="FILE",
-    help="table (CSV): t in s and a column for each joint, rad or m",
-)
+@click.argument("words", nargs=-1, metavar="TABLE LINK...")
+@old_option("--links", now="import ROBOT TABLE LINK...", default="")
+@old_option("--trajectory", now="import ROBOT TABLE LINK...")
 @click.option(
     "--tool", metavar="LINK", help="end-effector; default: end of the chosen links' chain"
 )
-@click.option(
+@old_option(
     "--package-path",
+    now="state folders with ROS packages in ROS_PACKAGE_PATH",
     multiple=True,
     type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="folder with ROS packages, for package:// in ROBOT; may be given several times. Then "
-    "ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the folders above ROBOT are looked through",
 )
 @click.option(
     "--closures",
@@ -258,8 +251,9 @@ def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
 @out_option("the scene; default: ROBOT without its ending")
 def import_robot(
     robot: Path,
+    words: tuple[str, ...],
     links: str,
-    trajectory: Path,
+    trajectory: str | None,
     tool: str | None,
     package_path: tuple[Path, ...],
     closures: Path | None,
@@ -267,12 +261,18 @@ def import_robot(
     overwrite: bool,
     out: Path | None,
 ) -> None:
-    """Make a scene of ROBOT, a URDF file.
+    """Make a scene of ROBOT, a URDF file, that moves as TABLE says.
 
-    The links named become solids in their own shape, mended where it must be, or boxes to edit
-    where there is none. The others are rigid. Inertias that cannot be are told, and so are joints
+    TABLE is a CSV file, t in s and a column for each joint, rad or m. The LINKs become solids in
+    their own shape, mended where it must be, or boxes to edit where there is none. The others are
+    rigid. Packages of package:// are looked for in ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the
+    folders above ROBOT. Inertias that cannot be are told, and so are joints
     beyond their limits.
     """
+    table, *names = [*([] if trajectory is None else [trajectory]), *words, links]
+    chosen = tuple(name for word in ",".join(names).split(",") if (name := word.strip()))
+    if not chosen:
+        raise InputError("import: expected a table and links: dolfinopt import ROBOT TABLE LINK...")
     world = start()
     from dolfinopt.parallel import together
 
@@ -283,13 +283,7 @@ def import_robot(
                 from dolfinopt.mesh.solid_cells import msh_bytes
 
                 model = _robot(robot, package_path)
-                chosen = tuple(name for word in links.split(",") if (name := word.strip()))
-                if not chosen:
-                    raise InputError(
-                        f"--links {links!r}: expected names of links of {model.file}, A,B"
-                    )
                 write_mesh = None if boxes else msh_bytes
-                table = os.fspath(trajectory)
                 found = scene_of_robot(model, chosen, tool, table, closures, write_mesh, warn)
             _write_scene(out or Path(robot.stem), overwrite, *found)
 
@@ -602,23 +596,26 @@ class Format:
 
     write: Callable[..., None]
     options: tuple[str, ...]
+    last: tuple[str, Callable[[str], Any]] | None = None  # what the word behind it is
 
 
 FORMATS = {
     "bodies": Format(_export_bodies, ("design", "set")),
-    "robot": Format(export_robot, ("before",)),
-    "state-space": Format(_export_state_space, ("design", "set", "at", "below")),
+    "robot": Format(export_robot, ("before",), ("before", Path)),
+    "state-space": Format(_export_state_space, ("design", "set", "at", "below"), ("at", float)),
 }
 
 
 @click.command()
 @scene_argument
 @click.argument("kind", type=click.Choice(list(FORMATS)), default="bodies", metavar="[WHAT]")
+@click.argument("last", required=False, metavar="[T | BEFORE]")
 @design_option
 @out_option("the files; default: results/SCENE-WHAT, or urdf or state-space in the folder of a run")
 @overwrite_option
 @set_option
-@click.option("--at", type=float, metavar="T", help="of state-space: instant, s")
+@old_option("--at", now="export SCENE state-space T", type=float)
+@old_option("--before", now="export RUN robot BEFORE", type=PATH)
 @click.option(
     "--below",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -626,17 +623,12 @@ FORMATS = {
     help="of state-space: poles below this frequency hold 1 %; the arms take as many coordinates "
     "as that needs; default: those of the scene",
 )
-@click.option(
-    "--before",
-    type=PATH,
-    metavar="DIR",
-    help="of robot: an earlier run of the robot, for a table and a page of both",
-)
-@click.option("--urdf", is_flag=True, hidden=True)  # older word of robot
-@click.option("--state-space", "instant", type=float, hidden=True)  # and of state-space --at
+@old_option("--urdf", now="export RUN robot", is_flag=True)
+@old_option("--state-space", "instant", now="export SCENE state-space T", type=float)
 def export(
     scene: Path,
     kind: str,
+    last: str | None,
     out: Path | None,
     overwrite: bool,
     overrides: tuple[str, ...],
@@ -649,8 +641,9 @@ def export(
     \b
       bodies       the reduced arms (default)
       robot        of the folder of a finished run: the URDF robot that its
-                   scene was imported from, with the run's links
-      state-space  the machine linearised about its motion at --at T, as
+                   scene was imported from, with the run's links; with
+                   BEFORE, an earlier run, a table and a page of both
+      state-space  the machine linearised about its motion at T, s, as
                    A, B, C, D (.npz, .mat); of a scene or a run's folder
 
     Bodies are standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem), with
@@ -662,8 +655,21 @@ def export(
         given["at"] = instant if given["at"] is None else given["at"]
     given["set"] = overrides
     chosen = FORMATS[kind]
+    if last is not None:
+        given |= _last_word(kind, chosen, last)
     for name, value in given.items():
         if value not in (None, ()) and name not in chosen.options:
             users = " or ".join(word for word, one in FORMATS.items() if name in one.options)
             raise InputError(f"--{name}: expected with {users}, not with {kind}")
     chosen.write(scene, out, overwrite, *(given[name] for name in chosen.options))
+
+
+def _last_word(kind: str, chosen: Format, word: str) -> dict[str, Any]:
+    """Return the value, by its name, that stands behind a format."""
+    if chosen.last is None:
+        raise InputError(f"{word}: expected nothing behind {kind}")
+    name, read = chosen.last
+    try:
+        return {name: read(word)}
+    except ValueError:
+        raise InputError(f"{word}: expected an instant, s, behind {kind}") from None

@@ -19,7 +19,7 @@ import click
 from dolfinopt.cli.exchange import export, import_robot
 from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.shared import PATH, Start, end_before_start, led_by_another
+from dolfinopt.cli.shared import PATH, Start, end_before_start, led_by_another, old_option
 from dolfinopt.cli.studies import bench, compare, reproduce, sweep, uncertainty
 from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
@@ -41,15 +41,16 @@ TEMPLATES = {
 
 @click.command(
     help="Write a commented scene, NAME.toml (default: scene.toml).\n\n"
-    "\b\nTemplates:\n" + "\n".join(f"  {name:<16}{what}" for name, what in TEMPLATES.items())
+    "\b\nTEMPLATE is one of\n"
+    + "\n".join(f"  {name:<16}{what}" for name, what in TEMPLATES.items())
 )
 @click.argument("name", default="scene", type=PATH)
-@click.option(
-    "--template", type=click.Choice(list(TEMPLATES)), default="two-arm", help="what to start from"
-)
-def init(name: Path, template: str) -> None:
+@click.argument("template", type=click.Choice(list(TEMPLATES)), default="two-arm")
+@old_option("--template", "older", now="init NAME TEMPLATE", type=click.Choice(list(TEMPLATES)))
+def init(name: Path, template: str, older: str | None) -> None:
     if led_by_another():
         return
+    template = older or template
     from dolfinopt.output.folders import write_new
     from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
     from dolfinopt.scene.tables.base import Refusal

@@ -14,6 +14,7 @@ import click
 from dolfinopt.cli.shared import (
     PATH,
     load,
+    old_option,
     out_option,
     overwrite_option,
     plots_option,
@@ -36,6 +37,7 @@ PRESETS = ("payload", "flattening", "coordinates")
 # Preset by the command's word; members of uniform section are a study of their own.
 COMPARED = {"objectives": "objective", "reductions": "reduction"}
 SECTIONS, MOTIONS = "sections", "motions"
+COARSE, FITTED = "coarse", "fitted"  # variants of the paper's scene
 
 designs_option = click.option(
     "--design",
@@ -180,13 +182,8 @@ def sweep(
 @click.command()
 @scene_argument
 @click.argument("what", type=click.Choice([*COMPARED, SECTIONS, MOTIONS]))
-@click.option(
-    "--only",
-    multiple=True,
-    metavar="WHAT",
-    help="any number of times: of the objectives a kind, by default all; of the reductions a "
-    "number of coordinates, by default 4 and 12",
-)
+@click.argument("kinds", nargs=-1, metavar="[KIND...]")
+@old_option("--only", now="compare SCENE WHAT KIND...", multiple=True)
 @click.option(
     "--design",
     "designs",
@@ -199,20 +196,23 @@ def sweep(
 def compare(
     scene: Scene,
     what: str,
+    kinds: tuple[str, ...],
     only: tuple[str, ...],
     designs: tuple[Path, ...],
 ) -> Question:
     """Optimise SCENE for every objective or with every reduction, and compare the designs.
 
-    With sections: compare its design with straight tubes and bars, of the same mass and the
+    KINDs are words of objective.kind, by default all, or numbers of coordinates, by default 4 and
+    12. With sections: compare its design with straight tubes and bars, of the same mass and the
     lightest that hold the limits. With motions: compare joints on the rigid path, input shapers
     and feed-forward, with the machine as it is and with other payloads, stiffness, damping.
 
     What is computed is kept in DIR and taken from there the next time; a call that was
     interrupted goes on.
     """
-    if only and what in (SECTIONS, MOTIONS):
-        raise InputError("--only: expected only with compare SCENE objectives or reductions")
+    kinds += only
+    if kinds and what in (SECTIONS, MOTIONS):
+        raise InputError(f"{kinds[0]}: expected nothing behind compare SCENE {what}")
     if what == SECTIONS:
         from dolfinopt.study.sections import NAME, study_sections
 
@@ -224,8 +224,9 @@ def compare(
     from dolfinopt.study.studies import study
 
     preset: Any = COMPARED[what]
-    vary = [f"reduction.coordinates={','.join(only)}"] if only and what == "reductions" else []
-    kinds = only if what == "objectives" else ()
+    vary = []
+    if kinds and what == "reductions":
+        vary, kinds = [f"reduction.coordinates={','.join(kinds)}"], ()
     return preset, designs, partial(study, scene, preset, vary, designs, kinds=kinds), {}
 
 
@@ -258,22 +259,15 @@ def uncertainty(
 
 
 @click.command()
-@out_option("figures, report.html and cases; default: results/paper")
-@click.option("--check", is_flag=True, help="end with status 1 if one of the main checks fails")
-@click.option(
-    "--coarse",
-    is_flag=True,
-    help="100 x 6 cells, a filter of two of them and 60 iterations: a minute",
-)
-@click.option(
-    "--fitted",
-    is_flag=True,
-    help="a scene whose values that the paper does not state are fitted to its statements; default "
-    "folder: results/paper-fitted",
-)
+@click.argument("variants", nargs=-1, type=click.Choice([COARSE, FITTED]))
+@out_option("figures, report.html and cases; default: results/paper, or paper-fitted")
+@old_option("--check", now="reproduce always checks the paper's own scene", is_flag=True)
+@old_option("--coarse", now="reproduce coarse", is_flag=True)
+@old_option("--fitted", now="reproduce fitted", is_flag=True)
 @set_option
 @plots_option
 def reproduce(
+    variants: tuple[str, ...],
     out: Path | None,
     check: bool,
     coarse: bool,
@@ -282,6 +276,10 @@ def reproduce(
     plots: bool,
 ) -> None:
     """Recreate figures 3 to 15 of the paper, and a page that compares its statements with ours.
+
+    The exit status is 1 if one of the main statements does not hold. "coarse" takes 100 x 6 cells,
+    a filter of two of them and 60 iterations, a minute; "fitted" a scene whose values that the
+    paper does not state are fitted to its statements: there nothing is demanded.
 
     What is computed is kept in DIR/cases and taken from there the next time; a call that was
     interrupted goes on.
@@ -292,6 +290,7 @@ def reproduce(
     from dolfinopt.paper.reproduction import check_paper, failed_checks
     from dolfinopt.parallel import on_root
 
+    coarse, fitted = coarse or COARSE in variants, fitted or FITTED in variants
     folder = out or Path("results") / ("paper-fitted" if fitted else "paper")
     overrides = (*(paper.FITTED if fitted else ()), *overrides)
     scene = on_root(world, paper.load_paper, coarse, overrides)
@@ -311,21 +310,19 @@ def reproduce(
 
     on_root(world, conclude)  # a rank that raised below meanwhile would end the root at its writing
     failures = [f"{o.case.label}: {o.failure}" for o in outcomes.failures]
-    wrong = [*failures, *(failed_checks(checks) if check else ())]
+    wrong = [*failures, *(failed_checks(checks) if check or not (coarse or overrides) else ())]
     if wrong:
         raise ConvergenceError("; ".join(wrong))
 
 
-FIELD = "field"
+FIELD, QUICK = "field", "quick"
 
 
 @click.command()
-@click.argument("names", metavar="[DIAGRAM... | field [CASE...]]", nargs=-1)
+@click.argument("names", metavar="[quick] [DIAGRAM... | field [CASE...]]", nargs=-1)
 @out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
-@click.option("--quick", is_flag=True, help="coarse meshes, fewer points: some minutes")
-@click.option(
-    "--records", type=PATH, metavar="DIR", help="of field: measured records that a case reads"
-)
+@old_option("--quick", now="bench quick", is_flag=True)
+@old_option("--records", now="bench field CASE=DIR", type=PATH)
 def bench(
     names: tuple[str, ...],
     out: Path | None,
@@ -335,27 +332,32 @@ def bench(
     """Measure run time against error, or check the benchmark of the field.
 
     Diagrams of integrators, iterations, elements and errors, beside other programs; or those named
-    alone: time, iteration, mesh, tolerance. Two run only when they are named: solid measures solid
-    links up to a million degrees of freedom (needs 14 GB), optimiser solves thirteen problems from
-    three starts (half an hour).
+    alone: time, iteration, mesh, tolerance; with "quick" on coarse meshes, some minutes. Two run
+    only when they are named: solid measures solid links up to a million degrees of freedom (needs
+    14 GB), optimiser solves thirteen problems from three starts (half an hour).
 
     What is measured is kept in DIR; a call that was interrupted goes on.
 
     `dolfinopt bench field` runs the published problems of the folder benchmarks and prints every
     value beside its reference, with difference, limit and verdict; exit status 1 where a limit is
     missed. By default the quick cases, some ten seconds; those named alone; "all" with the long
-    ones; with --records DIR those, too, that read measured records which cannot be copied: ur10e.
+    ones; with CASE=DIR one that reads measured records which cannot be copied: ur10e.
     """
     world = start()
+    if QUICK in names:
+        names, quick = tuple(name for name in names if name != QUICK), True
     if names[:1] == (FIELD,):
         if quick:
-            raise InputError("bench field: --quick does not go with it")
-        _check_field(world, out, names[1:], records)
+            raise InputError("bench field: quick does not go with it")
+        measured = dict(name.split("=", 1) for name in names[1:] if "=" in name)
+        records = next(map(Path, measured.values()), records)
+        cases = tuple(name for name in names[1:] if "=" not in name)
+        _check_field(world, out, cases if cases == ("all",) else (*cases, *measured), records)
         return
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
     if records:
-        raise InputError("bench: --records belongs to dolfinopt bench field")
+        raise InputError("bench: measured records belong to dolfinopt bench field")
     _measure(names, out, quick)
 
 

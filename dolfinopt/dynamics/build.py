@@ -454,8 +454,7 @@ def check_instant(scene: Scene, t: float) -> None:
     """Raise `InputError` when an instant, s, is not within the motion."""
     if not 0.0 <= t <= scene.motion.horizon:
         raise InputError(
-            f"--at {t:g}: expected an instant from 0 to motion.horizon = "
-            f"{scene.motion.horizon:g} [s]"
+            f"{t:g} s: expected an instant from 0 to motion.horizon = {scene.motion.horizon:g} [s]"
         )
 
 

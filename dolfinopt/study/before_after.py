@@ -89,11 +89,10 @@ def _figures(summary: Summary) -> Iterator[tuple[str, float | None, str]]:
         yield name, None if value is None else 1e3 * value, unit
     for link, frequency in links.items():
         yield f"first frequency of {link}", frequency, "Hz"
-    joints = {one["name"]: one["type"] for one in summary["scene"].get("joints", ())}
+    units = summary["units"]["drive_peak"]
     for key, word in (("drive_peak", "peak"), ("drive_rms", "root mean square")):
         for drive, value in (summary.get(key) or {}).items():
-            slides = joints.get(drive) == "prismatic" or (not joints and drive == "cart")
-            yield f"{word} of drive {drive}", value, "N" if slides else "N m"
+            yield f"{word} of drive {drive}", value, units[drive]
 
 
 # -- page ------------------------------------------------------------------------------------

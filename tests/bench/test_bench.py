@@ -411,9 +411,9 @@ def test_command(tmp_path, monkeypatch, capsys):
         (("field", "sling"), ("sling", "rod")),
         (("field", "rod", "all"), ("all",)),
         (("field", "time"), ("field", "time")),
-        (("field", "--quick"), ("field", "--quick")),
-        (("field", "ur10e"), ("--records", "dynamic_calibration")),
-        (("field", "ur10e", "--records", "nowhere"), ("nowhere", "ur10e.urdf")),
+        (("field", "quick"), ("field", "quick")),
+        (("field", "ur10e"), ("ur10e=DIR", "dynamic_calibration")),
+        (("field", "ur10e=nowhere"), ("nowhere", "ur10e.urdf")),
     ],
 )
 def test_wrong_words(words, told):

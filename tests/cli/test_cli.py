@@ -489,7 +489,7 @@ def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys, write_scen
     """Both files hold the same matrices, with names, whatever the ranks; refusals write nothing."""
     path, out = write_scene(controlled()), shared_tmp_path / "run"
     run("simulate", path, *QUICK, "--out", out, "--no-plots")
-    run("export", out, "state-space", "--at", 3.0)
+    run("export", out, "state-space", 3.0)
     run("export", path, *QUICK, "--state-space", 3.0, "--out", shared_tmp_path / "scene")
     folders = (out / "state-space", shared_tmp_path / "scene")
     first, second = (np.load(one / "state_space.npz") for one in folders)
@@ -509,10 +509,10 @@ def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys, write_scen
         assert "with its control, at 3 s: 22 states, 6 inputs, 7 outputs" in told
         assert f"poles below {float(first['accurate_below']):.4g} Hz hold 1 %" in told
     for words, expected in (
-        ([path, "state-space", "--at", 5.0], "motion.horizon = 3"),
-        ([path, "state-space"], "--at"),
+        ([path, "state-space", 5.0], "motion.horizon = 3"),
+        ([path, "state-space"], "an instant"),
         ([path, "--below", 100.0], "state-space, not with bodies"),
-        ([out, "state-space", "--at", 1.0, "--set", "payload.mass=2"], "--set"),
+        ([out, "state-space", 1.0, "--set", "payload.mass=2"], "--set"),
         ([out], "add robot or state-space"),
     ):
         line = ["export", *words, "--out", shared_tmp_path / "none"]

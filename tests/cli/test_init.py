@@ -40,7 +40,7 @@ def test_one_of_two_ranks_writes(tmp_path):
 def test_a_template_is_a_scene(tmp_path, capsys, template):
     """Complete but for the own geometry, plausible, and known to the schema in its first line."""
     assert {path.stem for path in template_folder().glob("*.toml")} == set(TEMPLATES)
-    run("init", tmp_path / 'my "machine"', "--template", template)
+    run("init", tmp_path / 'my "machine"', template)
     scene = tmp_path / 'my "machine".toml'
     said = capsys.readouterr().out
     assert "dolfinopt optimize" in said and str(scene) in said
@@ -63,7 +63,7 @@ def test_a_template_is_a_scene(tmp_path, capsys, template):
 @pytest.mark.parametrize("template", [name for name in TEMPLATES if name != "step"])
 def test_a_template_is_improved_by_its_optimisation(tmp_path, template):
     """On its own mesh; pick-and-place ended softer than it began with its exact gradient."""
-    run("init", tmp_path / "machine", "--template", template)
+    run("init", tmp_path / "machine", template)
     scene = read_scene(tmp_path / "machine.toml", ["optimizer.max_iterations=30"])
     history = dolfinopt.optimize(scene).history
     assert history[-1].objective < history[0].objective / 3.0
@@ -75,7 +75,7 @@ def test_init_replaces_nothing(tmp_path):
     for name, text in mine.items():
         (tmp_path / name).write_text(text)
     for name, word in (("a", "exists"), ("a.toml", "exists"), ("b", "exists"), ("a.toml/c", "be")):
-        line = ["init", tmp_path / name, "--template", "pick-and-place"]
+        line = ["init", tmp_path / name, "pick-and-place"]
         refusal(lambda: run(*line), word)  # noqa: B023
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == mine
     run("init", tmp_path / "deep" / "c.toml")

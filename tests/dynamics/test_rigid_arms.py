@@ -90,7 +90,7 @@ def test_commands(tmp_path, capsys) -> None:
     assert (out / "machine.png").exists()
     run("sweep", scene, "--vary", "payload.mass=1,2", "--out", tmp_path / "sweep")
     assert "rigid arms" in capsys.readouterr().out
-    run("export", out, "state-space", "--at", 0.3)
+    run("export", out, "state-space", 0.3)
     with np.load(out / "state-space" / "state_space.npz") as data:
         assert data["states"].tolist() == ["arm", "arm rate"]
     for words in (("optimize", scene), ("gradient", scene), ("part", out),

@@ -359,4 +359,4 @@ def test_frequency_below_which_poles_are_pairs() -> None:
 
 
 def test_instant_within_the_motion() -> None:
-    refusal(lambda: state_space(open_two_arm(), 4.0), "--at 4", "motion.horizon = 3")
+    refusal(lambda: state_space(open_two_arm(), 4.0), "4 s", "motion.horizon = 3")

@@ -25,7 +25,7 @@ def motion_of(tmp_path: Path, joints: tuple[str, ...]) -> Path:
 
 
 def bring(robot: Path, links: str, motion: Path, folder: Path) -> None:
-    run("import", robot, "--links", links, "--trajectory", motion, "--out", folder)
+    run("import", robot, motion, links, "--out", folder)
 
 
 @pytest.mark.parametrize(("file", "links", "joints", "mass"), ROBOTS, ids=lambda x: str(x)[:5])

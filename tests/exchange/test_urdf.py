@@ -190,7 +190,7 @@ def test_the_end_effector_is_the_last_arm(tmp_path):
     file = write_uneven(tmp_path)
     motion = tmp_path / "motion.csv"
     motion.write_text("t,yaw\n0,0\n1,1\n")
-    words = ("import", file, "--links", "upper", "--trajectory", motion, "--boxes", "--tool")
+    words = ("import", file, motion, "upper", "--boxes", "--tool")
     for tool, last in (("left", "left"), ("lower", "lower_end")):
         run(*words, tool, "--out", tmp_path / tool)
         scene = read_scene(tmp_path / tool / "uneven.toml")
@@ -216,7 +216,7 @@ def test_a_links_geometry_becomes_the_solid(tmp_path, capsys):
     file = tmp_path / "robot.urdf"
     file.write_text(text.replace(wrist, wrist + away))
     links = "upper_arm,forearm,wrist_1"
-    run("import", file, "--links", links, "--trajectory", DEMO_MOTION, "--out", tmp_path / "a")
+    run("import", file, DEMO_MOTION, links, "--out", tmp_path / "a")
     said = capsys.readouterr()
     for words in (
         r"forearm: solid, 0.729 x 0.11\d* x 0.11\d* m, its shape, \d{4} cells",
@@ -364,7 +364,7 @@ def test_visual_geometry_where_the_collision_one_is_no_solid(tmp_path, capsys):
     new += f"<collision>{away}</collision>"
     file = tmp_path / "robot.urdf"
     file.write_text(text[:start] + new + text[end:])
-    run("import", file, "--links", "forearm", "--trajectory", DEMO_MOTION, "--out",
+    run("import", file, DEMO_MOTION, "forearm", "--out",
         tmp_path / "a", "--package-path", tmp_path / "ws")  # fmt: skip
     said = capsys.readouterr()
     assert "forearm: visual geometry; 1 piece inside out turned" in said.out

@@ -177,7 +177,7 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys, drawn):
     (beside / "sections.json").write_text(json.dumps({"question": question}))
     (beside / "sections.md").write_text("The lightest tube wins.\n")
     (beside / "sections.csv").write_text("section,mass [kg]\nround tube,2.5\n")
-    run("export", tmp_path / "run", "robot", "--before", tmp_path / "run")
+    run("export", tmp_path / "run", "robot", tmp_path / "run")
     said = capsys.readouterr().out
     assert "kg, was 7.879 kg" in said and "largest tool deflection" in said
     rows = pd.read_csv(tmp_path / "run" / "urdf" / "before_after.csv", index_col="figure")
@@ -247,8 +247,7 @@ def test_before_and_after():
         "name": "robot", "mass": {"foot": 2.0, "link": 8.0}, "first_frequency": {"link": 50.0},
         "max_deviation": 2e-3, "settling": None, "drive_peak": {"yaw": 10.0, "rail": 4.0},
         "drive_rms": {"yaw": 5.0, "rail": 0.0},
-        "scene": {"joints": [{"name": "yaw", "type": "revolute"},
-                             {"name": "rail", "type": "prismatic"}]},
+        "units": {"drive_peak": {"yaw": "N m", "rail": "N"}},
     }  # fmt: skip
     other = one | {"mass": {"foot": 2.0, "link": 3.0}, "max_deviation": 1e-3}
     frame = before_after(one, other).frame.set_index("figure")

@@ -88,7 +88,7 @@ def test_a_motion_that_is_too_fast_is_told(tmp_path, capsys):
         ("base", ["'base'", "ground"]),
         ("tool", ["'tool'", "nothing hangs on it"]),
         ("forearm,forearm", ["twice"]),
-        (",", ["names of links"]),
+        (",", ["a table and links"]),
     ],
 )
 def test_links_that_cannot_be_solids(tmp_path, links, words):
@@ -213,7 +213,7 @@ def test_the_name_space_that_xacro_leaves_behind_is_no_xacro(tmp_path):
     assert list(read_robot(file).links) == ["b"]
     file.write_text('<robot><link name="b"/></robot>')
     assert read_robot(file).name == "r"  # its file's, where it has none
-    line = ["import", DEMO, "--links", "forearm", "--trajectory", DEMO_MOTION]
+    line = ["import", DEMO, DEMO_MOTION, "forearm"]
     refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "folder")
 
 

@@ -66,7 +66,7 @@ def linkage(folder: Path, table: str, motion: str = MOTION) -> tuple[Path, Path,
 def imported_to(folder: Path, table: str, motion: str = MOTION) -> Path:
     """Import the linkage; return the scene's file."""
     robot, loops, file = linkage(folder, table, motion)
-    words = ("--links", "tool", "--trajectory", file, "--boxes", "--out", folder / "scene")
+    words = (file, "tool", "--boxes", "--out", folder / "scene")
     run("import", robot, *words, "--closures", loops)
     return folder / "scene" / "linkage.toml"
 

@@ -80,7 +80,7 @@ UNEVEN_LINKS = (
 
 def run_import(file: Path, links: str, motion: Path, folder: Path, *more: str) -> None:
     """Import a robot with boxes for solids."""
-    told = "--links", links, "--trajectory", motion, "--out", folder, "--boxes"
+    told = motion, links, "--out", folder, "--boxes"
     run("import", file, *told, *more)
 
 

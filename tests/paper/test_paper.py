@@ -69,7 +69,7 @@ RESULTS = made_up()
 
 
 def test_made_up_results_meet_all_demands():
-    """All that `reproduce --check` demands, each of which can fail, see FLAWS."""
+    """All that `reproduce` demands, each of which can fail, see FLAWS."""
     checks = check_paper(RESULTS)
     assert failed_checks(checks) == []
     assert all(check.statement and check.found and check.criterion for check in checks)

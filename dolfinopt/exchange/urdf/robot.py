@@ -460,7 +460,7 @@ def _check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> Non
                 f"{robot.file}: link {name!r} stands on the ground; choose links that move"
             )
     if len(set(chosen)) < len(chosen):
-        raise InputError(f"--links {','.join(chosen)}: a link is named twice")
+        raise InputError(f"{robot.file}: {', '.join(chosen)}: a link is named twice")
 
 
 def default_tool(robot: Robot, chosen: tuple[str, ...]) -> str:
