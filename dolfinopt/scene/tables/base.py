@@ -88,11 +88,26 @@ class Use(NamedTuple):
     choice: str
     values: str = ""
 
+    @property
+    def words(self) -> str:
+        """Return e.g. 'used only with path = "arc"'."""
+        values = " or ".join(map(shown, self.values.split()))
+        return f"used only with {self.choice}" + f" = {values}" * bool(values)
+
 
 class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
 
     USES: ClassVar[tuple[Use, ...]] = ()
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Tell in the descriptions of keys what they are used with."""
+        for use in cls.USES:
+            for key in use.keys.split():
+                field = cls.model_fields[key]
+                meaning, _, unit = str(field.description).rpartition(" [")
+                field.description = f"{meaning}; {use.words} [{unit}"
 
     # Validators are built at first use, once for the whole scene, not when a table is imported.
     model_config = ConfigDict(
