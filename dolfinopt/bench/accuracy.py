@@ -168,9 +168,9 @@ def _motions(plan: Plan) -> Steps:
     @cache
     def designs() -> tuple[Arms, dict[str, Densities]]:
         scene = changed(plan.scene, f"optimizer.max_iterations={15 if plan.quick else 100}")
-        found = optimize(scene, world=MPI.COMM_SELF)
-        initial = {k: arm.uniform(scene.design.initial) for k, arm in found.arms.items()}
-        return dict(found.arms), dict(zip(DESIGNS, (initial, dict(found.x_phys))))
+        result = optimize(scene, world=MPI.COMM_SELF)
+        initial = {k: arm.uniform(scene.design.initial) for k, arm in result.arms.items()}
+        return dict(result.arms), dict(zip(DESIGNS, (initial, dict(result.x_phys))))
 
     @cache
     def reference(design: str, q: int) -> Reference:
@@ -183,10 +183,10 @@ def _motions(plan: Plan) -> Steps:
         for tolerance in TOLERANCES[:points]:  # coarse to fine
             try:
                 solve = partial(METHODS[method], tolerance, to)
-                seconds, _, found = timed(solve, plan.repeats, SHORT)
+                seconds, _, result = timed(solve, plan.repeats, SHORT)
             except ConvergenceError:
                 continue  # no point of the curve
-            error = relative_error(to.problem.mechanism, found - to.q, to.q)
+            error = relative_error(to.problem.mechanism, result - to.q, to.q)
             yield design, q, method, tolerance, seconds, error
             if 2.0 * seconds > patience:
                 return
@@ -313,7 +313,7 @@ def compared(cells: Row, problem: MachineSystem) -> Rows:
             runs[tolerance] = radau.integrate(problem, tolerance, STAGES, Profile())
         except ConvergenceError:
             runs[tolerance] = None
-    done = [one for one in runs.values() if one]
+    done = [run for run in runs.values() if run]
     right = reference(problem, done[-1]).sample(t) if done else np.empty(0)
     for tolerance, found in runs.items():
         row = np.inf, np.inf, 0

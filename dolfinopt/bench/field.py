@@ -70,10 +70,10 @@ class Case(Table):
     def _check(self) -> Case:
         if bool(self.scene) == bool(self.program):
             raise ValueError("expected either scene or program")
-        for one in self.values if self.scene else ():
-            known = HISTORIES if one.table else NUMBERS
-            if one.quantity not in known:
-                raise ValueError(f"quantity {one.quantity}: expected one of {', '.join(known)}")
+        for value in self.values if self.scene else ():
+            known = HISTORIES if value.table else NUMBERS
+            if value.quantity not in known:
+                raise ValueError(f"quantity {value.quantity}: expected one of {', '.join(known)}")
         return self
 
 
@@ -240,15 +240,15 @@ def check(case: Case, records: Path | None = None) -> list[Checked]:
     """
     if case.program:
         found = load_program(case.folder / case.program).values(records)
-        return [_number(case, one, found[one.quantity]) for one in case.values]
-    asked = any(one.quantity == "stress" for one in case.values)
+        return [_number(case, value, found[value.quantity]) for value in case.values]
+    asked = any(value.quantity == "stress" for value in case.values)
     model = Model(case.folder / case.scene, *case.overrides, comm=MPI.COMM_SELF)
     result = model.simulate(case.folder / case.design if case.design else None, stress=asked)
     return [
-        _history(case, one, result)
-        if one.table
-        else _number(case, one, float(NUMBERS[one.quantity](result)))
-        for one in case.values
+        _history(case, value, result)
+        if value.table
+        else _number(case, value, float(NUMBERS[value.quantity](result)))
+        for value in case.values
     ]
 
 

@@ -208,7 +208,7 @@ def pymoto_iteration(scene: Scene, cells: Sequence[int]) -> Iteration | None:
         return pym.DomainDefinition(*(n // step for n in cells), **units)
 
     domain = grid(1)
-    across = np.array([one.ravel() for one in np.indices([n + 1 for n in cells[1:]])])
+    across = np.array([index.ravel() for index in np.indices([n + 1 for n in cells[1:]])])
     left, right = (domain.get_nodenumber(at, *across) for at in (0, cells[0]))
     force, fixed = np.zeros(d * domain.nnodes), (d * left[:, None] + np.arange(d)).ravel()
     edge = [(at == 0) | (at == n) for at, n in zip(across, cells[1:], strict=True)]
@@ -278,7 +278,7 @@ def optimised(name: str, start: str, iterations: int) -> Rows:
     """Measure one problem from one start."""
     scene = posed(problems()[name], start, iterations)
     seconds, _, result = timed(partial(optimize, scene, world=MPI.COMM_SELF))
-    excess = max((one.excess for one in result.limits), default=0.0)
+    excess = max((limit.excess for limit in result.limits), default=0.0)
     asked = result.iterations, result.counts.simulations, result.counts.adjoints
     found = result.evaluation.objective, excess, result.best_iteration
     yield name, start, *asked, *found, seconds, result.stop_code.value
@@ -313,18 +313,18 @@ def drawn_by_hand(name: str, kind: str) -> Rows:
         if not scene.design.projection:  # grey at the edges, as what is optimised
             x = {k: arms[k].physical(one) for k, one in x.items()}
         try:
-            found, _ = evaluate(scene, partition, arms, x, Profile(), simulated=False)
+            result, _ = evaluate(scene, partition, arms, x, Profile(), simulated=False)
         except ConvergenceError:
             return True, np.inf, np.inf, size
-        excess = max((one.excess for one in limits_of(scene, found)), default=0.0)
-        return excess > EXCESS, sign * found.objective, excess, size
+        excess = max((one.excess for one in limits_of(scene, result)), default=0.0)
+        return excess > EXCESS, sign * result.objective, excess, size
 
     def best() -> tuple[bool, float, float, float]:
-        found = min(map(judged, np.linspace(STRIDE, 1.0, round(1.0 / STRIDE))))
+        result = min(map(judged, np.linspace(STRIDE, 1.0, round(1.0 / STRIDE))))
         for k in range(1, HALVINGS + 1):
-            near = (found[3] + side * STRIDE / 2**k for side in (-1.0, 1.0))
-            found = min(found, *(judged(size) for size in near if 0.0 < size <= 1.0))
-        return found
+            near = (result[3] + side * STRIDE / 2**k for side in (-1.0, 1.0))
+            result = min(result, *(judged(size) for size in near if 0.0 < size <= 1.0))
+        return result
 
     seconds, _, (_, value, excess, size) = timed(best)
     words = f"{100.0 * size:.1f} % of the height"

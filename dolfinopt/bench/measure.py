@@ -100,8 +100,8 @@ def in_processes(
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise ConvergenceError(f"{' '.join(command)}: {done.stderr.strip()[-2000:]}")
-    found, memory = json.loads(done.stdout.strip().splitlines()[-1])
-    return found, memory
+    result, memory = json.loads(done.stdout.strip().splitlines()[-1])
+    return result, memory
 
 
 def _main(module: str, name: str, text: str) -> None:

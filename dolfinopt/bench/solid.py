@@ -48,8 +48,8 @@ def link_scene(scene: Scene, cells: Cells, static: bool = False) -> Scene:
         "objective": {"kind": "static"} if static else {},
     }
     changed = {key: getattr(scene, key) for key in tables} | {"arms": scene.arms[0]}
-    found = {key: table.unchecked_copy(tables[key]) for key, table in changed.items()}
-    return scene.unchecked_copy(found | {"arms": (found["arms"],)})
+    result = {key: table.unchecked_copy(tables[key]) for key, table in changed.items()}
+    return scene.unchecked_copy(result | {"arms": (result["arms"],)})
 
 
 def box_beam(centroid: np.ndarray) -> np.ndarray:
@@ -85,10 +85,10 @@ def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool = Fals
         tip_gradient(state, loads, loads)
 
     iterate = loaded if static else dynamic
-    found = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
+    result = [_seconds(comm, iterate, x) for x in two_designs(arm.mesh.centroid)]
     parts = arm.substructure
     system = (parts.extended if static else None) or parts.interior
-    return parts.T.num_dofs, system.solver.name, found
+    return parts.T.num_dofs, system.solver.name, result
 
 
 def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:

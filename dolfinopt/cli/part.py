@@ -97,7 +97,7 @@ def part(
 
     Options go over the table [part] of the scene: "dolfinopt keys part" lists its keys.
     """
-    if other := [one for one in overrides if not one.startswith("part.")]:
+    if other := [override for override in overrides if not override.startswith("part.")]:
         raise InputError(f"--set {other[0]}: expected keys of [part], as part.starts=3")
     world = start()
     from dolfinopt.parallel import on_root, together

@@ -158,7 +158,7 @@ def _largest(summary: Summary) -> str:
 def _limits(limits: Sequence[Limit]) -> Iterator[str]:
     """Yield which limits hold and which do not, each with the share of it that is used."""
     for words, met in (("limits kept", True), ("limits not kept", False)):
-        if shown := [one.usage for one in limits if one.met is met]:
+        if shown := [limit.usage for limit in limits if limit.met is met]:
             yield f"{words}: {', '.join(shown)}"
 
 

@@ -122,7 +122,7 @@ def _inertia_matrices(body: ShapeIntegrals) -> dict[str, sid.Taylor]:
         push_q = -body.K0[:3].transpose(1, 2, 0)
     G, G_q = W[:, :, 0, 0], Y + Y.swapaxes(0, 1)
     coriolis = np.einsum("abc,abkl->klc", -2.0 * PERMUTATION, W[:, :, 1:, 1:])
-    found = {
+    result = {
         "mdCM": (body.w[:, :1], body.w[:, 1:, None]),
         "J": (_moments(G)[:, None], _moments(G_q)[:, :, None]),
         "Ct": (body.w[:, 1:].T, push_q),
@@ -138,7 +138,7 @@ def _inertia_matrices(body: ShapeIntegrals) -> dict[str, sid.Taylor]:
             nq=q,
             structure=sid.GENERAL,
         )
-        for name, (value, more) in found.items()
+        for name, (value, more) in result.items()
     }
 
 
@@ -283,9 +283,9 @@ def _stiffening(body: ShapeIntegrals, outboard: np.ndarray) -> tuple[np.ndarray,
     rotation = body.K0[3:].reshape(3, 3, q, q)
     inertial = [centrifugal(rotation), turning(rotation), body.K0[:3].transpose(1, 2, 0)]
     matrices = [0.0 - np.moveaxis(one, -1, 0) for one in inertial]
-    found = np.concatenate([*matrices, outboard])
-    acting = found.any(axis=(1, 2))
-    return 1 + np.flatnonzero(acting), found[acting]
+    result = np.concatenate([*matrices, outboard])
+    acting = result.any(axis=(1, 2))
+    return 1 + np.flatnonzero(acting), result[acting]
 
 
 # -- from SID --------------------------------------------------------------------------------

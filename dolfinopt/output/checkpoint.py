@@ -100,12 +100,12 @@ def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
-    found = hashlib.blake2b(digest_size=16)
+    result = hashlib.blake2b(digest_size=16)
     for key in sorted(arrays):
         one = arrays[key]
-        found.update(f"{key} {one.dtype.str} {one.shape}".encode())
-        found.update(one.tobytes())
-    return found.hexdigest()
+        result.update(f"{key} {one.dtype.str} {one.shape}".encode())
+        result.update(one.tobytes())
+    return result.hexdigest()
 
 
 def check(folder: Path, scene: Scene) -> None:
@@ -201,15 +201,15 @@ def _difference(theirs: Any, ours: Any, key: str = "") -> str:
             path = f"{key}.{name}" if key else name
             if path in MAY_CHANGE:
                 continue
-            found = _difference(theirs.get(name), ours.get(name), path)
-            if found:
-                return found
+            result = _difference(theirs.get(name), ours.get(name), path)
+            if result:
+                return result
         return ""
     if isinstance(theirs, list) and isinstance(ours, list) and len(theirs) == len(ours):
         for k, (a, b) in enumerate(zip(theirs, ours, strict=True)):
-            found = _difference(a, b, f"{key}.{k}")
-            if found:
-                return found
+            result = _difference(a, b, f"{key}.{k}")
+            if result:
+                return result
         return ""
     if theirs == ours:
         return ""

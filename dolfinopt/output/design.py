@@ -165,7 +165,7 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
     arm = scene.arms[index]
     pattern = scene.arms[scene.patterns.get(index, index)]
     scale = np.array([arm.length / pattern.length, arm.height / pattern.height])
-    found = []
+    outlines = []
     for region in pattern.regions:
         x0, y0, x1, y1 = region.bounds
         if region.box is not None:
@@ -174,10 +174,10 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
             turn = np.exp(2j * np.pi * np.arange(CIRCLE) / CIRCLE)
             radius = 0.5 * (x1 - x0)
             points = np.column_stack([x0 + radius * (1 + turn.real), y0 + radius * (1 + turn.imag)])
-        found.append((region.kind, points * scale))
+        outlines.append((region.kind, points * scale))
         if pattern.symmetric_about[0]:
-            found.append((region.kind, points * scale * [1.0, -1.0]))
-    return tuple(found)
+            outlines.append((region.kind, points * scale * [1.0, -1.0]))
+    return tuple(outlines)
 
 
 def _undesigned_view(arm: ArmKeys, dimension: int) -> ArmView:
@@ -259,8 +259,8 @@ def write_gradient(
 def by_law_name(scene: Scene, values: np.ndarray) -> dict[str, np.ndarray]:
     """Return values (n,) of the law's variables under their names in files."""
     count = len(scene.motion.coefficients)
-    found = {"motion/shape": values[:count], "motion/duration": values[count:]}
-    return {name: one for name, one in found.items() if len(one)}
+    result = {"motion/shape": values[:count], "motion/duration": values[count:]}
+    return {name: one for name, one in result.items() if len(one)}
 
 
 def under_law_of(scene: Scene, design: Path | None) -> Scene:
@@ -269,7 +269,7 @@ def under_law_of(scene: Scene, design: Path | None) -> Scene:
         return scene
     arrays, here = _load_design(design), by_law_name(scene, law_values(scene))
     values = [np.ravel(arrays.get(name, one)) for name, one in here.items()]
-    if [len(one) for one in values] != [len(one) for one in here.values()]:
+    if [len(value) for value in values] != [len(one) for one in here.values()]:
         raise InputError(
             f"{design}: motion/shape: {len(values[0])} coefficients, and motion.shape has "
             f"{len(scene.motion.coefficients)} in {scene.source}; state as many"
@@ -471,9 +471,9 @@ class _Sheet:
     @property
     def fields(self) -> dict[str, np.ndarray]:
         """What every cell has, by name."""
-        found = {"density": self.density, "arm": self.arm}
+        result = {"density": self.density, "arm": self.arm}
         more = {"stress": self.stress, "wall": self.wall}
-        return found | {name: values for name, values in more.items() if values is not None}
+        return result | {name: values for name, values in more.items() if values is not None}
 
 
 def _sheet(views: Sequence[ArmView]) -> _Sheet:

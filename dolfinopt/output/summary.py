@@ -233,7 +233,7 @@ def _of_designs(run: RankResult, traits: Mapping[int, _Traits]) -> dict[str, Any
     return {
         "grayness": _grayness(traits),
         "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},
-        "connected": max((one.contacts.pieces for one in traits.values()), default=0),
+        "connected": max((trait.contacts.pieces for trait in traits.values()), default=0),
         "contacts": {name: _contacts(one.contacts) for name, one in by_arm.items()},
         "minimum_member_measured": {name: _size(one.widths[0]) for name, one in by_arm.items()},
         "minimum_gap_measured": {name: _size(one.widths[1]) for name, one in by_arm.items()},
@@ -294,9 +294,9 @@ def _too_narrow(run: RankResult, traits: Mapping[int, _Traits]) -> list[_Narrow]
         return []
     return [
         _Narrow(run.scene.arms[k].name, what, width.size, asked, width.place, width.to, width.fixed)
-        for k, one in traits.items()
+        for k, trait in traits.items()
         for what, width, asked in zip(
-            ("member", "gap"), one.widths, design.least_widths, strict=True
+            ("member", "gap"), trait.widths, design.least_widths, strict=True
         )
         if width is not None and width.size < asked * (1.0 - 1e-9)
     ]
@@ -316,14 +316,14 @@ def _contacts(found: Contacts) -> dict[str, Any]:
 
 def _first_frequencies(run: RankResult, by_arm: Mapping[str, _Traits]) -> dict[str, float]:
     """Return those of flexible arms by name, Hz; of a body from a file, what its modes tell."""
-    found = {}
+    frequencies = {}
     bodies = () if run.trajectory is None else run.trajectory.mechanism.arms
     for arm, body in zip(run.scene.arms, bodies, strict=False):
         own = by_arm[arm.name].frequency if arm.name in by_arm else None
         value = body.first_frequency if own is None else own
         if np.isfinite(value):
-            found[arm.name] = value
-    return found
+            frequencies[arm.name] = value
+    return frequencies
 
 
 def _of_responses(run: RankResult) -> dict[str, Any]:
@@ -332,8 +332,8 @@ def _of_responses(run: RankResult) -> dict[str, Any]:
     return {
         "constraints": summary_of(run.limits),
         "scenarios": [
-            {"changes": list(one.changes), "weight": one.weight, **_figures(motion)}
-            for one, motion in zip(scene.scenarios, run.evaluation.scenarios, strict=True)
+            {"changes": list(scenario.changes), "weight": scenario.weight, **_figures(motion)}
+            for scenario, motion in zip(scene.scenarios, run.evaluation.scenarios, strict=True)
         ],
         **({} if run.crisp is None else {"crisp": _figures(run.crisp)}),
     }
@@ -361,7 +361,7 @@ def motion_warnings(run: Result) -> list[str]:
 
 def _all_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
     return [
-        *(note for one in traits.values() for note in one.notes),
+        *(note for trait in traits.values() for note in trait.notes),
         *motion_warnings(run),
         *_unstiffened(stiffening_of(run.arms)),
         *([] if is_grey(run.scene, _grayness(traits)) else _contact_warnings(run, traits)),
@@ -403,7 +403,7 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
 
     peak, rms = trajectory.drives
     bodies = trajectory.mechanism.arms
-    found = {
+    result = {
         "max_rotation": trajectory.max_rotation,
         "settling": trajectory.settling,
         "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
@@ -412,19 +412,19 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
         "drive_rms": by_drive(rms),
     }
     if of_joints := _by_joint(joint_limits(trajectory)):
-        found["joint_limits"] = of_joints
+        result["joint_limits"] = of_joints
     if free := free_drives(scene):
         errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
-        found["drive_error_peak"] = {name: errors[name] for name in free}
+        result["drive_error_peak"] = {name: errors[name] for name in free}
     if trajectory.closure_sizes:
-        found["closure_peak"] = {
+        result["closure_peak"] = {
             name: {unit: float(size.max()) for unit, size in sizes.items()}
             for name, sizes in trajectory.closure_sizes.items()
         }
     if trajectory.closure is not None:
         (sizes,) = trajectory.closure_sizes.values()
-        found["closure_force_peak"] = float(sizes["N"].max())
-    return found
+        result["closure_force_peak"] = float(sizes["N"].max())
+    return result
 
 
 def _designed_mass(scene: Scene, bodies: Sequence[Any]) -> float:
@@ -435,11 +435,11 @@ def _designed_mass(scene: Scene, bodies: Sequence[Any]) -> float:
 
 def _by_joint(limits: Iterable[JointLimit]) -> dict[str, dict[str, Any]]:
     """Return the limits of joints by joint and quantity."""
-    found: dict[str, dict[str, Any]] = {}
-    for one in limits:
-        entry = asdict(one)
-        found.setdefault(entry.pop("joint"), {})[entry.pop("quantity")] = entry
-    return found
+    result: dict[str, dict[str, Any]] = {}
+    for limit in limits:
+        entry = asdict(limit)
+        result.setdefault(entry.pop("joint"), {})[entry.pop("quantity")] = entry
+    return result
 
 
 def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
@@ -447,9 +447,10 @@ def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
     if trajectory is None:
         return []
     beyond = [
-        f"{one.joint} {one.value:.4g} of {one.limit:.4g} {one.unit} at {one.instant:.3g} s"
-        for one in joint_limits(trajectory)
-        if not one.met
+        f"{limit.joint} {limit.value:.4g} of {limit.limit:.4g} {limit.unit} "
+        f"at {limit.instant:.3g} s"
+        for limit in joint_limits(trajectory)
+        if not limit.met
     ]
     return [f"limits exceeded: {', '.join(beyond)}"] if beyond else []
 
@@ -496,7 +497,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
         rigid = scene.rigid_units
         units["drive_error_peak"] = {name: rigid[name] for name in free}
     if scene.closures:
-        parts = {one.name: one.parts(scene.dimension) for one in scene.closures}
+        parts = {closure.name: closure.parts(scene.dimension) for closure in scene.closures}
         units["closure_peak"] = {name: {u: u for _, u in own} for name, own in parts.items()}
         units |= {} if scene.is_spatial else {"closure_force_peak": "N"}
     units["history.csv"] = {"objective": unit, **HISTORY_UNITS, "multipliers": unit}
@@ -513,15 +514,15 @@ def _frequencies(
 ) -> dict[int, tuple[float, float]]:
     """Return every reduced design's first frequency, Hz, and the reduced model's excess."""
     # On the root (collective). It is not counted: nothing depends on it.
-    counts, found = replace(profile.counts), {}
+    counts, result = replace(profile.counts), {}
     with together(partition.world):
         for index, arm in arms.items():
             if arm.basis is not None:
                 state = arm.state(x_phys[index])
                 own = state.first_frequency
-                found[index] = own, max(0.0, state.body.first_frequency / own - 1.0)
+                result[index] = own, max(0.0, state.body.first_frequency / own - 1.0)
     profile.counts = counts
-    return gather_arms(partition, found)
+    return gather_arms(partition, result)
 
 
 def _widths(
@@ -573,10 +574,10 @@ def is_grey(scene: Scene, grayness: float) -> bool:
 
 def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
     """Return a sentence on every arm with contacts, and one where its crisp design falls apart."""
-    scene, found = run.scene, []
+    scene, result = run.scene, []
     rated = run.iterations > 0 and bool(scene.design.projection)
-    for k, one in traits.items():
-        contacts, arm = one.contacts, scene.arms[k]
+    for k, trait in traits.items():
+        contacts, arm = trait.contacts, scene.arms[k]
         if not contacts.count:
             continue
         kinds = {"corner": contacts.corners, "edge": contacts.edges}
@@ -592,11 +593,13 @@ def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[st
             text += f"; crisp leaves them out, and {100.0 * contacts.left_out:.2g} % of the solid"
             if contacts.remaining:
                 text += f", but for {contacts.remaining} without which the arm is cut in two"
-        found.append(f"{text}; {_against_contacts(scene, k, one.cell_size)}")
+        result.append(f"{text}; {_against_contacts(scene, k, trait.cell_size)}")
     if rated and run.crisp is None:
-        hanging = any(one.contacts.count and not one.contacts.joins for one in traits.values())
-        found.append(NO_JOINTS if hanging else FALLS_APART)
-    return found
+        hanging = any(
+            trait.contacts.count and not trait.contacts.joins for trait in traits.values()
+        )
+        result.append(NO_JOINTS if hanging else FALLS_APART)
+    return result
 
 
 def _against_contacts(scene: Scene, index: int, size: float) -> str:
@@ -630,19 +633,19 @@ def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
 def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:
     """Return what makes the figures doubtful, a sentence each: deflections that are not small."""
     motions: list[tuple[str, Motion]] = [("", evaluation)]
-    for one, motion in zip(scene.scenarios, evaluation.scenarios, strict=True):
-        motions.append((f" with {', '.join(one.changes)}", motion))
-    found = []
+    for scenario, motion in zip(scene.scenarios, evaluation.scenarios, strict=True):
+        motions.append((f" with {', '.join(scenario.changes)}", motion))
+    warnings = []
     for where, motion in motions:
         for arm, u, turn in zip(scene.arms, motion.deflections, motion.turns, strict=False):
             if u > SMALL or turn > SMALL_TURN:
-                found.append(
+                warnings.append(
                     f"arm {arm.name!r} deflects by {100.0 * u:.3g} % of its length and its end "
                     f"turns by {np.degrees(turn):.3g} degrees{where}: beyond {100.0 * SMALL:g} % "
                     f"or {np.degrees(SMALL_TURN):.0f} degrees the model of small deflections is "
                     "inaccurate; stiffen the arm or slow the motion"
                 )
-    return found
+    return warnings
 
 
 def _reduction(scene: Scene, choice: OrderSelection | None) -> dict[str, Any]:
@@ -746,8 +749,8 @@ def budget_of(trajectory: Trajectory | None) -> dict[str, Any] | None:
     """
     if trajectory is None or trajectory.feed_forward is not None:
         return None
-    found = deflection_budget(trajectory)
-    return None if found is None else {**asdict(found), "shares": found.shares}
+    result = deflection_budget(trajectory)
+    return None if result is None else {**asdict(result), "shares": result.shares}
 
 
 def write_budget(folder: Path, budget: Mapping[str, Any] | None) -> None:

@@ -43,7 +43,7 @@ def torsion_warnings(trajectory: Trajectory | None) -> list[str]:
     """Return a sentence on every arm whose error in torsion counts."""
     if trajectory is None or trajectory.scene.dimension == 2:
         return []
-    mechanism, found = trajectory.mechanism, []
+    mechanism, result = trajectory.mechanism, []
     for arm, body, part in zip(
         trajectory.scene.arms, mechanism.bodies, mechanism.slices, strict=False
     ):
@@ -54,9 +54,9 @@ def torsion_warnings(trajectory: Trajectory | None) -> list[str]:
             continue
         error, share = torsion_error(*arm.cells[1:]), torsion_share(body, q)
         if error * share > ERROR_LIMIT:
-            found.append(
+            result.append(
                 f"arm {arm.name!r}: torsion is {100.0 * share:.0f} % of its strain energy, and "
                 f"{arm.cells[1]} x {arm.cells[2]} cells over its section are too stiff in torsion "
                 f'by {100.0 * error:.2g} %; set element = "quadratic", or use more cells there'
             )
-    return found
+    return result

@@ -116,7 +116,7 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
     pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
     names = list(scene.rigid_units)
     soft = {names[k] for k, one in pairs if k is not None and one.stiffness > 0.0}
-    soft |= {one.name for one in scene.rods if one.is_spring}
+    soft |= {rod.name for rod in scene.rods if rod.is_spring}
     return tuple(name for name in scene.driven if name in soft)
 
 
@@ -157,9 +157,9 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
 def _closure_units(scene: Scene) -> dict[str, str]:
     """Return the unit of every force and moment of closures by its column, `closure_NAME_PART`."""
     return {
-        "_".join(filter(None, ("closure", one.name, part))): unit
-        for one in scene.closures
-        for part, unit in one.parts(scene.dimension)
+        "_".join(filter(None, ("closure", closure.name, part))): unit
+        for closure in scene.closures
+        for part, unit in closure.parts(scene.dimension)
     }
 
 

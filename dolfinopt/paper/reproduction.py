@@ -141,8 +141,8 @@ class Plan:
             label = f"made for {words.format(value)}"
             designs.append((label, value, Case(scenes[value], "optimize", label=label)))
         for label, made_for, design in designs:
-            for value, one in scenes.items():
-                there = variants.changed(one, "design.initial=1.0") if label == SOLID else one
+            for value, scene in scenes.items():
+                there = variants.changed(scene, "design.initial=1.0") if label == SOLID else scene
                 case = Case(there, "simulate", design, f"{label}, {words.format(value)}")
                 yield table, label, "", value, made_for, case, design or case
 
@@ -237,7 +237,7 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
         _over_time(with_modes, [outcome for outcome in again if not outcome.failure]),
         *(_sweep(by[name], name, what) for name, what in product(SWEEPS, QUANTITIES)),
     ]
-    figures: Figures = {n: (one, one) for n, one in zip((3, *range(5, 14)), lines, strict=True)}
+    figures: Figures = {n: (line, line) for n, line in zip((3, *range(5, 14)), lines, strict=True)}
     names = {"label": "made for", "grayness": "grayness [-]", "note": "ended by"}
     columns = ["label", *QUANTITIES, "grayness", "iterations", "note"]
     designs = studies.design_figure("", "Designs by objective", good(objectives.case))
@@ -432,7 +432,7 @@ def _of_payloads(rows: pd.DataFrame) -> dict[str, Any]:
     return {
         "payloads": x[[0, -1]],
         "made_for": made.index[[0, -1]],
-        "bend_deviation": np.max([bend(x, one.deviation) for one in designs.values()]),
+        "bend_deviation": np.max([bend(x, design.deviation) for design in designs.values()]),
         "bend": [bend(x, y) for y in curves],
         "power": [power(x, y) for y in curves],
         "payload_differ": np.max(np.abs(made.iloc[0].to_numpy() / made.iloc[-1].to_numpy() - 1.0)),
@@ -465,8 +465,8 @@ def _losses(rows: pd.DataFrame) -> list[float]:
 
 def span(values: Iterable[float]) -> float:
     """Return (largest - smallest) / largest; nan where a value is."""
-    found = np.array([*values])
-    return float((found.max() - found.min()) / found.max())
+    result = np.array([*values])
+    return float((result.max() - result.min()) / result.max())
 
 
 def bend(x: Iterable[float], y: Iterable[float]) -> float:

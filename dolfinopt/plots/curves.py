@@ -265,7 +265,7 @@ def deviation_figure(
         times = np.linspace(t[0], t[-1], len(initial))
         curves = [(INITIAL, times, initial), (OPTIMISED, t, deviation)]
     distances = [MILLI * lengths(vectors) for _, _, vectors in curves]
-    largest = [float(d.max()) for d in distances] + [MILLI * one[0] for one in limits]
+    largest = [float(d.max()) for d in distances] + [MILLI * limit[0] for limit in limits]
     top = 1.1 * max(largest) or 1.0
     heights = spread([float(d.max()) / top for d in distances], 0.07)
     # A curve alone looks like the optimised design's.
@@ -442,20 +442,20 @@ def constraint_label(name: str) -> str:
 
 def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
     """Return the limit of every column of history.csv that is a constraint's."""
-    found: dict[str, float] = {}
+    result: dict[str, float] = {}
     for one in constraints_of(scene):
         own = [c for c in columns if c == one.name or c.startswith(f"{one.name}_")]
         limits = [float(limit) for limit in np.broadcast_to(one.limit, len(own))]
-        found.update(zip(own, limits, strict=True))
-    return found
+        result.update(zip(own, limits, strict=True))
+    return result
 
 
 def deviation_limits(scene: Scene) -> list[tuple[float, float, float]]:
     """Return the limits of the deviation, m, with first and last instant of each, s."""
-    found = []
+    limits = []
     if (deviation := scene.constraints.limit("deviation")) is not None:
-        found.append((deviation, scene.lead, scene.horizon))
+        limits.append((deviation, scene.lead, scene.horizon))
     if (settling := scene.constraints.limit("settling")) is not None:
         lead = scene.lead
-        found += [(settling, lead + begin, lead + end) for begin, end in rests(scene)]
-    return found
+        limits += [(settling, lead + begin, lead + end) for begin, end in rests(scene)]
+    return limits

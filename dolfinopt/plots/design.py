@@ -314,7 +314,9 @@ def _draw_plate(axes: Axes, loops: Sequence[np.ndarray], depth: np.ndarray) -> N
 
 def _compound(loops: Sequence[np.ndarray]) -> Path:
     """Return the face within an outline and without its holes."""
-    return Path.make_compound_path(*(Path(np.vstack([one, one[:1]]), closed=True) for one in loops))
+    return Path.make_compound_path(
+        *(Path(np.vstack([loop, loop[:1]]), closed=True) for loop in loops)
+    )
 
 
 # -- polygons: areas and outlines -------------------------------------------------------------

@@ -204,18 +204,18 @@ def solid_designs_figure(
     figure = new_figure(COLUMN * columns + 0.4, height, laid_out=True)
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for axes, row, label in zip(grid, rows, labels, strict=True):
-        for one in axes:
-            one.set(xlim=(0.0, wide), ylim=(0.0, tall), aspect="equal")
-            one.set_axis_off()
-        for one, view in zip(axes, row):
+        for panel in axes:
+            panel.set(xlim=(0.0, wide), ylim=(0.0, tall), aspect="equal")
+            panel.set_axis_off()
+        for panel, view in zip(axes, row):
             low, high = _seen(bounds(view))
             studio = Studio(LINKS, low, high, COLUMN * DPI / wide)
             studio.solid(material(view), color=STEEL)
             _draw_edges(studio, bounds(view))
             studio.low, studio.high = low - low, high - low
-            studio.show(one, studio.close())
-            one.set(xlim=(0.0, wide), ylim=(0.0, tall))
-            one.set_title(view.name, loc="right", color=GREY)
+            studio.show(panel, studio.close())
+            panel.set(xlim=(0.0, wide), ylim=(0.0, tall))
+            panel.set_title(view.name, loc="right", color=GREY)
         axes[0].set_title(label)
     figure.suptitle(title, x=0.01, ha="left", fontsize=TITLE)
     return figure

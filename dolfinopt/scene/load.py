@@ -198,7 +198,9 @@ def pose_scenarios(scene: Scene) -> tuple[Scene, ...]:
         return ()
     plain = scene.to_tree() | {"scenarios": []}
     del plain["objective"]["scenarios"]  # there is nothing to combine
-    return tuple(scene_from_dict(plain, scene.source, one.changes) for one in scene.scenarios)
+    return tuple(
+        scene_from_dict(plain, scene.source, scenario.changes) for scenario in scene.scenarios
+    )
 
 
 def _check_tables(tree: dict[str, Any], source: str, changes: Sequence[Override] = ()) -> None:
@@ -352,13 +354,13 @@ def _read_text(source: str) -> str:
 
 def _syntax_error(message: str, text: str) -> str:
     """Move the place in the parser's message to its front: "line 3, column 5: not valid ..."."""
-    found = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
-    if not found:
+    result = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
+    if not result:
         return f"not valid TOML: {message}"
-    line, column = found.groups()
+    line, column = result.groups()
     if line is None:
         line, column = text.count("\n") + 1, len(text) - text.rfind("\n")
-    return f"line {line}, column {column}: not valid TOML: {message[: found.start()]}"
+    return f"line {line}, column {column}: not valid TOML: {message[: result.start()]}"
 
 
 def _copy_tables(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -378,7 +380,7 @@ def _copied(value: Any) -> Any:
 def _inherit(tree: dict[str, Any], keys: Iterable[str]) -> set[Loc]:
     """Fill each arm's missing `keys` from the arm before; return their paths."""
     inherited: set[Loc] = set()
-    fixed = [one.get("child") for one in rows(tree, "joints") if one.get("type") == "fixed"]
+    fixed = [row.get("child") for row in rows(tree, "joints") if row.get("type") == "fixed"]
     for i, (before, arm) in enumerate(pairwise(rows(tree, "arms")), start=1):
         taken = {key for keys in _replaced(arm) for key in keys}
         if arm.get("name") in fixed:

@@ -207,8 +207,8 @@ def _meaning(field: FieldInfo) -> str:
 
 def unit_of(field: FieldInfo) -> str:
     """Return the unit at the end of a field's description, "-" where it has none."""
-    found = re.search(r" \[([^\]]*)\]$", str(field.description))
-    return found[1] if found else "-"
+    result = re.search(r" \[([^\]]*)\]$", str(field.description))
+    return result[1] if result else "-"
 
 
 def allowed_words(field: FieldInfo) -> str:
@@ -408,7 +408,7 @@ def _old_words(scene: Scene) -> list[str]:
 
 
 def _materials(scene: Scene) -> list[str]:
-    found: dict[str, None] = {}  # arms mostly have one material: no sentence twice
+    sentences: dict[str, None] = {}  # arms mostly have one material: no sentence twice
     for index, arm in enumerate(scene.arms):
         if arm.sid is not None:
             continue
@@ -421,48 +421,48 @@ def _materials(scene: Scene) -> list[str]:
             where = f"arms.{arm.name}" if getattr(arm, key) is not None else "material"
             values = value if isinstance(value, tuple) else (value,)
             for one in (one for one in values if not low <= one <= high):
-                found[
+                sentences[
                     f"{where}.{key} = {one:g} {unit} is outside the range of structural "
                     f"materials, {low:g} to {high:g} {unit}; check the unit"
                 ] = None
-    return list(found)
+    return list(sentences)
 
 
 def _sizes(scene: Scene) -> list[str]:
-    found = []
+    sentences = []
     for index, arm in enumerate(scene.arms):
         radius = scene.filter_radius(index) if arm.designed else 0.0
         if not arm.own:
             continue
         if arm.height > arm.length and arm.interface_offset is None:
-            found.append(
+            sentences.append(
                 f"arms.{arm.name}: its height, {arm.height:g} m, exceeds its length, "
                 f"{arm.length:g} m, which is measured from joint to joint; check both"
             )
         if arm.length > SLENDER * arm.height or arm.thickness > SLENDER * arm.height:
-            found.append(
+            sentences.append(
                 f"arms.{arm.name}: length {arm.length:g} m, height {arm.height:g} m and thickness "
                 f"{arm.thickness:g} m differ by more than a factor of {SLENDER:g}; check the units"
             )
         if radius > arm.height:
-            found.append(
+            sentences.append(
                 f"design.filter_radius = {radius:g} m exceeds the height of arm {arm.name!r}, "
                 f"{arm.height:g} m: its design cannot vary across the arm"
             )
-    return found
+    return sentences
 
 
 def _motion(scene: Scene) -> list[str]:
-    found = []
+    result = []
     damping, motion = scene.damping.stiffness_proportional, scene.motion
     if need_of(scene, "motion") and damping > motion.duration:
-        found.append(
+        result.append(
             f"damping.stiffness_proportional = {damping:g} s: deflections relax in that time, "
             f"longer than motion.duration = {motion.duration:g} s, so that the arms hardly "
             "deflect; usual values are 1e-5 to 1e-2 s"
         )
     if max(map(abs, motion.gravity)) > GRAVITY:
-        found.append(
+        result.append(
             f"motion.gravity = {list(motion.gravity)} m/s2 exceeds {GRAVITY:g} m/s2; that of the "
             "Earth is 9.81"
         )
@@ -471,11 +471,11 @@ def _motion(scene: Scene) -> list[str]:
         for index, arm in enumerate(scene.arms)
     )
     if scene.payload.mass > HEAVY * mass:
-        found.append(
+        result.append(
             f"payload.mass = {scene.payload.mass:g} kg is more than {HEAVY:g} times the mass of "
             f"all arms, {mass:.3g} kg"
         )
-    return found
+    return result
 
 
 def _solid_ends(scene: Scene) -> list[str]:

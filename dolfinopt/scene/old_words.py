@@ -94,9 +94,9 @@ def _bore(name: str) -> Callable[[Tree, Row, Any], None]:
     def translate(tree: Tree, row: Row, value: Any) -> None:
         given = value if isinstance(value, Mapping) else {}
         others = row.get("interfaces") or []
-        known: Row = next((one for one in others if one.get("name") == name), {})
+        known: Row = next((other for other in others if other.get("name") == name), {})
         row["interfaces"] = [{"name": name, **known, **given}]
-        row["interfaces"] += [one for one in others if one.get("name") != name]
+        row["interfaces"] += [other for other in others if other.get("name") != name]
 
     return translate
 

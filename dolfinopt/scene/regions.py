@@ -152,12 +152,12 @@ def grid_shares(arm: Arm) -> tuple[float, float]:
     if arm.n_cells > MOST_CELLS:
         return 0.0, 0.0
     assert arm.cells is not None
-    found, _ = grid_regions(arm)
+    result, _ = grid_regions(arm)
     along, *others = _grid(arm)
     columns, across = arm.passive_columns, math.prod(others)
-    inner = found.solid[columns * across : (along - columns) * across]
+    inner = result.solid[columns * across : (along - columns) * across]
     count = along * across
-    return float(inner.sum() / count), float(found.void.sum() / count)
+    return float(inner.sum() / count), float(result.void.sum() / count)
 
 
 def _grid(arm: Arm) -> tuple[int, ...]:

@@ -241,19 +241,19 @@ class Scene(Table):
         """Return the interfaces, as of `end_effector`, of joints, forces and the payload."""
         sites = [force.arm for force in self.forces]
         sites += [joint.parent for joint in self.joints]
-        sites += [end for one in self.closures for end in one.between]
+        sites += [end for closure in self.closures for end in closure.between]
         places = {place_of(self, site) for site in sites}
         return frozenset({self.end_effector, *(place for place in places if place is not None)})
 
     @property
     def dependent_joints(self) -> int:
         """Number of joints, the last ones, that follow from the others in a closed loop."""
-        return 0 if self.is_spatial else sum(len(one.parts(2)) for one in self.closures)
+        return 0 if self.is_spatial else sum(len(closure.parts(2)) for closure in self.closures)
 
     @property
     def is_pinned(self) -> bool:
         """Whether a pin holds the end-effector in the plane, which deviates from nothing then."""
-        return not self.is_spatial and any(one.kind == "pin" for one in self.closures)
+        return not self.is_spatial and any(closure.kind == "pin" for closure in self.closures)
 
     @property
     def driven(self) -> tuple[str, ...]:
@@ -263,21 +263,21 @@ class Scene(Table):
         """
         if self.is_spatial:
             joints = tuple(joint.name for joint in self.movable if not joint.passive)
-            return joints + tuple(one.name for one in self.closures if one.driven)
+            return joints + tuple(closure.name for closure in self.closures if closure.driven)
         names = tuple(arm.name for arm in self.arms[: len(self.arms) - self.dependent_joints])
         return names if self.motion.base == "fixed" else ("cart", *names)
 
     @property
     def rods(self) -> tuple[Closures, ...]:
         """Rods whose length is a rigid coordinate, behind those of the joints."""
-        return tuple(one for one in self.closures if one.has_coordinate)
+        return tuple(closure for closure in self.closures if closure.has_coordinate)
 
     @property
     def rigid_units(self) -> dict[str, str]:
         """Unit of every rigid coordinate by its name: cart, then the arms; in space the joints."""
         if self.is_spatial:
             units = {one.name: "m" if one.type == "prismatic" else "rad" for one in self.movable}
-            return units | {one.name: "m" for one in self.rods}
+            return units | {rod.name: "m" for rod in self.rods}
         return {"cart": "m", **{arm.name: "rad" for arm in self.arms}}
 
     @property
@@ -428,15 +428,15 @@ def _plain(node: Any) -> Any:
         kinds = [kind for kind in node["anyOf"] if kind != {"type": "null"}]
         rest = {key: value for key, value in node.items() if key != "anyOf"}
         node = rest | (kinds[0] if len(kinds) == 1 else {"anyOf": kinds})
-    found = {}
+    result = {}
     for key, value in node.items():
         if key == "properties":
-            found[key] = {name: _plain(item) for name, item in value.items()}
+            result[key] = {name: _plain(item) for name, item in value.items()}
         elif key == "prefixItems":
-            found["items"] = _plain(value)
+            result["items"] = _plain(value)
         elif key != "title" and (key, value) != ("default", None):
-            found[key] = _plain(value)
-    return found
+            result[key] = _plain(value)
+    return result
 
 
 # -- files that a scene names: known by their content, and found again where a project has moved

@@ -400,19 +400,19 @@ class _Reader:
         while self.name != "part" or self.value is not None:
             self.next("'part'")
         comment = self.lines[0].split("modes:", 1)[-1].strip() if self.number > 1 else ""
-        found = self.block("part", {"modal": self.modal}, {}, {})
-        if not found:
+        result = self.block("part", {"modal": self.modal}, {}, {})
+        if not result:
             raise self.fail("'new modal' before")
-        return replace(found["modal"], comment=comment)
+        return replace(result["modal"], comment=comment)
 
     def modal(self) -> StandardInputData:
-        found: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         nodes: dict[str, Node] = {}
 
         def number() -> int:
-            if not found:
+            if not result:
                 raise self.fail("'refmod' first, which has the number of coordinates")
-            return len(found["refmod"][1])
+            return len(result["refmod"][1])
 
         def node() -> None:
             name = self.value or ""
@@ -426,34 +426,34 @@ class _Reader:
 
         once: Items = {"refmod": self.refmod}
         once |= {key: partial(lambda name: self.taylor(name, number()), key) for key in BODY}
-        self.block("modal", once, {"frame": frame}, found)
-        self.complete(found, ("refmod", *BODY), "before")
-        mass, names = found.pop("refmod")
-        return StandardInputData(mass, names, tuple(nodes.values()), **found)
+        self.block("modal", once, {"frame": frame}, result)
+        self.complete(result, ("refmod", *BODY), "before")
+        mass, names = result.pop("refmod")
+        return StandardInputData(mass, names, tuple(nodes.values()), **result)
 
     def refmod(self) -> tuple[float, tuple[str, ...]]:
         """Return the mass and the names of the coordinates."""
-        found: dict[str, Any] = {}
+        result: dict[str, Any] = {}
         names: dict[int, str] = {}
 
         def name() -> None:
-            if "nelastq" not in found:
+            if "nelastq" not in result:
                 raise self.fail("'nelastq' before the names")
-            (k,) = self.place((found["nelastq"],))
+            (k,) = self.place((result["nelastq"],))
             names[k] = self.value or ""
 
         once: Items = {"mass": self.real, "nelastq": partial(self.integer, 0, MOST)}
-        self.block("refmod", once, {"ielastq": name}, found)
-        self.complete(found, once, "before")
-        return found["mass"], tuple(names.get(k, "") for k in range(found["nelastq"]))
+        self.block("refmod", once, {"ielastq": name}, result)
+        self.complete(result, once, "before")
+        return result["mass"], tuple(names.get(k, "") for k in range(result["nelastq"]))
 
     def node(self, name: str, nq: int) -> Node:
         rframe = [""]
         once: Items = {key: partial(self.taylor, key, nq) for key in NODE}
         often: Items = {"rframe": lambda: rframe.append(self.value or "")}
-        found = self.block("node", once, often, {})
-        self.complete(found, (key for key in NODE if key != "sigma"), f"of node {name} before")
-        return Node(name, rframe[-1], **found)
+        result = self.block("node", once, often, {})
+        self.complete(result, (key for key in NODE if key != "sigma"), f"of node {name} before")
+        return Node(name, rframe[-1], **result)
 
     def taylor(self, name: str, nq: int) -> Taylor:
         """Read one matrix, check its dimensions and fill it."""

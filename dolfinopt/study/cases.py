@@ -131,12 +131,14 @@ class Outcome:
     def __str__(self) -> str:
         if self.failure:
             return f"{self.case.title}: failed: {self.failure}"
-        found = f"compliance {self.compliance:.4g} N m, deviation {1e3 * self.max_deviation:.4g} mm"
+        result = (
+            f"compliance {self.compliance:.4g} N m, deviation {1e3 * self.max_deviation:.4g} mm"
+        )
         if self.case.action == "optimize":
-            found = f"{self.iterations} iterations, {found}"
+            result = f"{self.iterations} iterations, {result}"
         elif self.case.action != "simulate":
-            found = f"{len(self.case.samples)} samples"
-        return f"{self.case.title}: {found}, {self.seconds:.1f} s"
+            result = f"{len(self.case.samples)} samples"
+        return f"{self.case.title}: {result}, {self.seconds:.1f} s"
 
     @property
     def failures(self) -> list[str]:
@@ -144,7 +146,9 @@ class Outcome:
         if not self.messages:
             return [f"{self.case.title}: {self.failure}"] if self.failure else []
         case = self.case
-        names = {k: f"{k} ({', '.join(one)})" for k, one in enumerate(case.samples, case.first)}
+        names = {
+            k: f"{k} ({', '.join(sample)})" for k, sample in enumerate(case.samples, case.first)
+        }
         return [f"{case.label}, sample {names[k]}: {text}" for k, text in self.messages.items()]
 
     @property
@@ -346,16 +350,16 @@ class _Place:
         failed = self._failure(case).exists()
         path = self._failure(case) if failed else self[case] / SUMMARY
         data = json.loads(path.read_text("utf-8"))
-        found: dict[str, Any] = {"failure": data["message"] if failed else ""}
+        result: dict[str, Any] = {"failure": data["message"] if failed else ""}
         if case.action == "sample":
             samples = data.get("samples", {})
-            found["samples"] = {name: np.array(values, float) for name, values in samples.items()}
-            found["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
+            result["samples"] = {name: np.array(values, float) for name, values in samples.items()}
+            result["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
         elif not failed:
-            found |= {name: data[name] for name in FIGURES}
+            result |= {name: data[name] for name in FIGURES}
         if not failed:
-            found["seconds"] = data["seconds"]["total"]
-        return Outcome(case, self[case], **found)
+            result["seconds"] = data["seconds"]["total"]
+        return Outcome(case, self[case], **result)
 
     def check(self) -> None:
         """Tell of cases that have ended; raise OthersFailed if another rank has failed."""
@@ -531,8 +535,10 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
     for case in cases:
         place.check()
         begun, scene = time.perf_counter(), case.scene
-        scenes = [with_sample(scene, one, k) for k, one in enumerate(case.samples, case.first)]
-        keys = (change.partition("=")[0] for one in case.samples for change in one)
+        scenes = [
+            with_sample(scene, sample, k) for k, sample in enumerate(case.samples, case.first)
+        ]
+        keys = (change.partition("=")[0] for sample in case.samples for change in sample)
         scaled = scales_bodies(scene, keys)
         if scaled and nominal is None:
             (nominal,) = simulate_scenarios([scene], design)

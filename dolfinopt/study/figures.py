@@ -28,13 +28,17 @@ Looks = Mapping[str, Mapping[str, Any]]
 
 def draw_study(study: tables.Study, folder: Path) -> list[Path]:
     """Draw every figure of a study as FOLDER/<study>[_<figure>].png; return the paths."""
-    return draw_all({tables.joined(study.name, one.name): one for one in study.figures}, folder)
+    return draw_all(
+        {tables.joined(study.name, figure.name): figure for figure in study.figures}, folder
+    )
 
 
 def draw_all(figures: Mapping[str, tables.Figure], folder: Path) -> list[Path]:
     """Draw figures in common looks as FOLDER/<name>.png; return the paths."""
     styles = common_looks(figures.values())
-    return [style.save(draw(one, styles), folder / f"{name}.png") for name, one in figures.items()]
+    return [
+        style.save(draw(figure, styles), folder / f"{name}.png") for name, figure in figures.items()
+    ]
 
 
 def common_looks(figures: Iterable[tables.Figure]) -> Looks:

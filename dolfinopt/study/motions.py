@@ -77,12 +77,12 @@ def study_motions(scene: Scene, designs: Sequence[Path], runner: Runner) -> Stud
         searched = [design, Case(with_kind(scene, "tip"), "optimize", label=DESIGNED)]
         found = runner.run(searched)
         if found.failures:
-            failed = tuple(text for one in found.failures for text in one.failures)
+            failed = tuple(text for failure in found.failures for text in failure.failures)
             return Study(NAME, (), (), failed, runner.computed)
         files = [found[one].design for one in searched]
     motions = on_root(runner.world, _motions, scene, files, runner.folder / NAME)
-    done = runner.run(one.case for one in motions)
-    rows = [(one, done[one.case]) for one in motions]
+    done = runner.run(motion.case for motion in motions)
+    rows = [(motion, done[motion.case]) for motion in motions]
     with together(runner.world):
         table, figure = report(scene, rows)
     failed = tuple(text for _, outcome in rows for text in outcome.failures)
@@ -109,31 +109,31 @@ def with_kind(scene: Scene, kind: str) -> Scene:
 def machines(scene: Scene) -> dict[str, str]:
     """Return what differs in the machines that motions do not know, by their names."""
     material, damping = scene.material, scene.damping.stiffness_proportional
-    found = {}
+    result = {}
     if scene.payload.mass > 0.0:
-        found["payload + 10 %"] = f"payload.mass={TEN_PERCENT * scene.payload.mass!r}"
+        result["payload + 10 %"] = f"payload.mass={TEN_PERCENT * scene.payload.mass!r}"
     if isinstance(material.young_modulus, float):
-        found["E - 5 %"] = f"material.young_modulus={FIVE_PERCENT * material.young_modulus!r}"
+        result["E - 5 %"] = f"material.young_modulus={FIVE_PERCENT * material.young_modulus!r}"
     if damping > 0.0:
-        found["half the damping"] = f"damping.stiffness_proportional={0.5 * damping!r}"
-    return found
+        result["half the damping"] = f"damping.stiffness_proportional={0.5 * damping!r}"
+    return result
 
 
 def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list[Motion]:
     """Return the motions with the first design, and feed-forward with the second (root only)."""
     first, *second = designs
     rigid, forward = _judged(with_kind(scene, "none")), _judged(with_kind(scene, "tip"))
-    found = [Motion(Case(rigid, "simulate", first, RIGID), finer=finer_deviation(rigid, first))]
+    motions = [Motion(Case(rigid, "simulate", first, RIGID), finer=finer_deviation(rigid, first))]
     frequency, damping_ratio = build_system(rigid, _bodies(rigid, first)).slowest_vibration(2)
     if frequency > 0.0 and scene.motion.table_ends == "rest":
         for kind, label in SHAPERS.items():
             shaper = input_shaper(kind, frequency, damping_ratio)
             shaped = write_shaped(rigid, shaper, folder / f"{kind}.csv")
-            found.append(Motion(Case(shaped, "simulate", first, label), shaper.longer))
+            motions.append(Motion(Case(shaped, "simulate", first, label), shaper.longer))
     for label, design in zip((FORWARD, DESIGNED), (first, *second), strict=False):
         case = Case(forward, "simulate", design, label)
-        found.append(Motion(case, 2.0 * forward.lead, finer_deviation(forward, design)))
-    return found
+        motions.append(Motion(case, 2.0 * forward.lead, finer_deviation(forward, design)))
+    return motions
 
 
 def _judged(scene: Scene) -> Scene:

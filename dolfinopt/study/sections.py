@@ -118,7 +118,7 @@ class Members:
 
     def of_mass(self, masses: Mapping[str, float]) -> Shares | None:
         """Return the shares with which every arm has its mass, kg; None where one cannot."""
-        found = []
+        result = []
         for k in self.arms:
 
             def gap(share: float) -> float:
@@ -126,8 +126,8 @@ class Members:
 
             if gap(LEAST) > 0.0 or gap(self.most) < 0.0:
                 return None
-            found.append(float(brentq(gap, LEAST, self.most, xtol=1e-9)))
-        return tuple(found)
+            result.append(float(brentq(gap, LEAST, self.most, xtol=1e-9)))
+        return tuple(result)
 
     def sizes(self, shares: Shares) -> str:
         """Return the sizes of every arm in words, in mm."""
@@ -214,21 +214,21 @@ def lightest(members: Members, simulate: Simulate) -> Found:
         no simulation succeeded.
     """
     count, move = len(members.arms), MOVE
-    found = _on_limit(members, simulate, (members.most,) * count)
-    if found is None or not found[1]:
-        return found
-    best = found[0]
+    result = _on_limit(members, simulate, (members.most,) * count)
+    if result is None or not result[1]:
+        return result
+    best = result[0]
     while count > 1 and move >= LEAST_MOVE:
         stepped = [_stepped(members, best, k) for k in range(count)]
         outcomes = simulate([best, *stepped])
         balanced = on_root(
             members.runner.world, _balanced, members, best, stepped, outcomes, move
         )  # others' last digits may differ
-        found = _on_limit(members, simulate, balanced)
+        result = _on_limit(members, simulate, balanced)
         gain = 0.0
-        if found is not None and found[1]:
-            gain = 1.0 - members.total_mass(found[0]) / members.total_mass(best)
-            best = found[0] if gain > 0.0 else best
+        if result is not None and result[1]:
+            gain = 1.0 - members.total_mass(result[0]) / members.total_mass(best)
+            best = result[0] if gain > 0.0 else best
         if gain < WORTH:  # the power laws hold over less than that, or there is no more to gain
             move *= 0.5
     return best, True
@@ -315,7 +315,7 @@ def _balanced(
     whole = members.total_mass(shares)
     low, high = math.log(LEAST), math.log(members.most)
     bounds = [(max(low, x - move), min(high, x + move)) for x in start]
-    found = minimize(
+    result = minimize(
         lambda x: members.total_mass(tuple(np.exp(x))) / whole,
         start,
         method="SLSQP",
@@ -326,7 +326,7 @@ def _balanced(
             "jac": lambda x: -slopes,
         },
     )
-    return tuple(float(one) for one in np.exp(found.x)) if found.success else shares
+    return tuple(float(one) for one in np.exp(result.x)) if result.success else shares
 
 
 # -- the study -------------------------------------------------------------------------------
@@ -359,13 +359,13 @@ class Row:
     def holds(self) -> bool:
         """Whether it holds every limit but that of the volume."""
         limits = _limits(self.outcome).values()
-        return not self.outcome.failure and all(one["met"] for one in limits)
+        return not self.outcome.failure and all(limit["met"] for limit in limits)
 
 
 def _limits(outcome: Outcome) -> dict[str, Any]:
     """Return the scene's limits and what becomes of them, without that of the volume."""
-    found = outcome.summary().get("constraints", {})
-    return {name: one for name, one in found.items() if not name.startswith("volume_fraction")}
+    result = outcome.summary().get("constraints", {})
+    return {name: one for name, one in result.items() if not name.startswith("volume_fraction")}
 
 
 def study_sections(scene: Scene, designs: Sequence[Path], runner: Runner) -> Study:
@@ -501,7 +501,9 @@ def verdict(scene: Scene, rows: Sequence[Row]) -> str:
     design, *others = rows
     if not limited(design.outcome):
         return _by_objective(scene, design, others)
-    over = {name: _excess(one) for name, one in _limits(design.outcome).items() if not one["met"]}
+    over = {
+        name: _excess(limit) for name, limit in _limits(design.outcome).items() if not limit["met"]
+    }
     missed = ", ".join(f"{name} {100.0 * x:.2g} % over its limit" for name, x in over.items())
     weight = f"{design.mass:.4g} kg" + f" ({missed})" * bool(over)
     broken = max(over.values(), default=0.0) > SLIGHT
@@ -555,10 +557,10 @@ def _cells(scene: Scene, row: Row) -> dict[str, Any]:
     cells[f"objective [{scene.objective.response.unit}]"] = outcome.objective
     for name in (COMPLIANCE, DEVIATION, "settling [mm]", "stress [MPa]", "grayness [-]"):
         cells[name] = known[name]
-    for name, one in _limits(outcome).items():
-        sign = ">=" if one["bound"] == "least" else "<="
-        key = f"{name.replace('_', ' ')} {sign} {one['limit']:g} {one['unit']}"
-        cells[key] = f"{one['value']:.4g} {'met' if one['met'] else 'not met'}"
+    for name, limit in _limits(outcome).items():
+        sign = ">=" if limit["bound"] == "least" else "<="
+        key = f"{name.replace('_', ' ')} {sign} {limit['limit']:g} {limit['unit']}"
+        cells[key] = f"{limit['value']:.4g} {'met' if limit['met'] else 'not met'}"
     if outcome.failure:
         cells["failed"] = outcome.failure
     return cells

@@ -327,13 +327,13 @@ def _sweep(
             for (label, there, columns), design in zip(points, designs, strict=True)
         ]
 
-    found = [row for n, d in given.items() for row in rows("shown", n, [d] * len(points))]
+    result = [row for n, d in given.items() for row in rows("shown", n, [d] * len(points))]
     if reoptimize:
         optima = [Case(there, "optimize", label=f"optimised, {n}") for n, there, _ in points]
-        found += rows("shown", MADE, optima)
+        result += rows("shown", MADE, optima)
         for i, (label, *_) in enumerate(points if fits else ()):
-            found += rows("crossed", f"made for {label}", [optima[i]] * len(points), i)
-    return found
+            result += rows("crossed", f"made for {label}", [optima[i]] * len(points), i)
+    return result
 
 
 def _sweep_report(frame: pd.DataFrame, keys: Sequence[Vary], prefix: str = "") -> Report:
@@ -452,7 +452,7 @@ def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     forces = [np.array([*one.get("drive_rms", none).values()]) for one in found]
     by = 1.0 if weights is None else np.array(weights)
     whole = frame.rename(columns={"label": "objective"}).assign(
-        **{"effort [-]": [float(np.linalg.norm(one * by)) for one in forces]},
+        **{"effort [-]": [float(np.linalg.norm(force * by)) for force in forces]},
         **{"mass [kg]": [sum(one.get("mass", none).values()) for one in found]},
     )
     columns = ["objective", *QUANTITIES, "at [s]", "settling [mm]", "stress [MPa]", "effort [-]",

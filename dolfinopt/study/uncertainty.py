@@ -175,7 +175,9 @@ def unit_points(count: int, dimensions: int, seed: int) -> np.ndarray:
 
 def draw(distributions: Sequence[Distribution], points: np.ndarray) -> np.ndarray:
     """Return the samples (n, d) at points (n, d) of the unit cube."""
-    return np.stack([one.at(points[:, i]) for i, one in enumerate(distributions)], axis=1)
+    return np.stack(
+        [distribution.at(points[:, i]) for i, distribution in enumerate(distributions)], axis=1
+    )
 
 
 # -- statistics ------------------------------------------------------------------------------
@@ -255,7 +257,10 @@ def polynomial_indices(
         return Indices(none, none, 0, 0.0)
     degrees = [p for p in range(1, MAX_DEGREE + 1)
                if math.comb(dimensions + p, p) <= n / SAMPLES_A_TERM] or [1]  # fmt: skip
-    single = [one.polynomials(samples[:, i], degrees[-1]) for i, one in enumerate(distributions)]
+    single = [
+        distribution.polynomials(samples[:, i], degrees[-1])
+        for i, distribution in enumerate(distributions)
+    ]
     fits = []
     for degree in degrees:
         chosen = combinations_with_replacement(range(dimensions + 1), degree)  # the last is 1
@@ -265,8 +270,8 @@ def polynomial_indices(
         fits.append((degree, powers, *_fit(basis, spread)))
     degree, powers, coefficients, without, missed = min(fits, key=lambda fit: fit[-1])
     shares, leaving = _shares(powers, coefficients[None])[0], _shares(powers, without)
-    found = [_jackknife(share, others) for share, others in zip(shares, leaving.T)]
-    return Indices(found[:dimensions], found[dimensions:], degree, missed)
+    result = [_jackknife(share, others) for share, others in zip(shares, leaving.T)]
+    return Indices(result[:dimensions], result[dimensions:], degree, missed)
 
 
 def _fit(basis: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
@@ -398,7 +403,7 @@ def sample_cases(
     scene: Scene, samples: Sequence[tuple[str, ...]], label: str, design: Design
 ) -> list[Case]:
     """Return the cases of one design: an interruption costs one, more samples leave them be."""
-    keys = {change.partition("=")[0] for one in samples for change in one}
+    keys = {change.partition("=")[0] for sample in samples for change in sample}
     size = CHUNK if scales_bodies(scene, keys) else REDUCED
     return [
         Case(scene, "sample", design, label, tuple(samples[first : first + size]), first)

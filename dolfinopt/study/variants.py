@@ -158,7 +158,7 @@ def with_objective(scene: Scene, kind: str, *settings: str) -> Scene:
     tree = scene.to_tree()
     tree["objective"] |= {"kind": kind}
     _drop_unused(tree)
-    return scene_from_dict(tree, scene.source, [f"objective.{one}" for one in settings])
+    return scene_from_dict(tree, scene.source, [f"objective.{setting}" for setting in settings])
 
 
 def posed(scene: Scene, kind: str) -> Scene:

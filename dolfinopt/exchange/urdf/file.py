@@ -73,7 +73,7 @@ def read_robot(file: Path, package_path: Sequence[Path] = ()) -> Robot:
 def _quiet() -> Iterator[None]:
     """Keep what yourdfpy and trimesh log to themselves: errors are told in one line."""
     loggers = [logging.getLogger(name) for name in ("yourdfpy", "yourdfpy.urdf", "trimesh")]
-    levels = [(one, one.level) for one in loggers]
+    levels = [(logger, logger.level) for logger in loggers]
     for one in loggers:
         one.setLevel(logging.CRITICAL)
     try:
@@ -171,14 +171,14 @@ def _joint(file: Path, one: Any) -> RobotJoint:
 
 def _friction(where: str, one: Any) -> tuple[float, float]:
     """Return viscous and Coulomb friction of the element <dynamics>; 0 where nothing is stated."""
-    found = []
+    result = []
     for word in ("damping", "friction"):
         value = None if one.dynamics is None else getattr(one.dynamics, word)
         value = 0.0 if value is None or one.type == "fixed" else float(value)
         if not (math.isfinite(value) and value >= 0.0):
             raise InputError(f"{where}: dynamics {word} = {value:g}; expected a number >= 0")
-        found.append(value)
-    return found[0], found[1]
+        result.append(value)
+    return result[0], result[1]
 
 
 def _limit(where: str, word: str, limit: Any) -> float:
@@ -227,15 +227,15 @@ def _ordered(
             f"{file}: {len(roots)} links that no joint holds ({', '.join(roots) or 'none'}); "
             "expected one, which stands on the ground"
         )
-    placed, found, waiting = {roots[0]}, [], list(joints)
+    placed, result, waiting = {roots[0]}, [], list(joints)
     while waiting:
         first = next((joint for joint in waiting if joint.parent in placed), None)
         if first is None:
             raise InputError(f"{file}: joint {waiting[0].name!r} is part of a loop")
-        found.append(first)
+        result.append(first)
         placed.add(first.child)
         waiting.remove(first)
-    return roots[0], tuple(found)
+    return roots[0], tuple(result)
 
 
 # -- links -----------------------------------------------------------------------------------
@@ -320,14 +320,14 @@ def _mesh(file: Path, mesh: Any, package_path: Sequence[Path]) -> Trimesh:
     if path is None:
         raise FileNotFoundError(f"mesh {mesh.filename} not found{_similar(file, mesh.filename)}")
     try:
-        found: Any = trimesh.load_mesh(os.fspath(path))
+        result: Any = trimesh.load_mesh(os.fspath(path))
     except Exception as error:  # every format has its own
         raise FileNotFoundError(f"mesh {mesh.filename} cannot be read") from error
-    if not isinstance(found, trimesh.Trimesh) or not len(found.faces):
+    if not isinstance(result, trimesh.Trimesh) or not len(result.faces):
         raise FileNotFoundError(f"mesh {mesh.filename} holds no triangles")
     if mesh.scale is not None:
-        found.apply_scale(mesh.scale)
-    return found
+        result.apply_scale(mesh.scale)
+    return result
 
 
 def _similar(file: Path, name: str) -> str:
@@ -344,8 +344,8 @@ def _similar(file: Path, name: str) -> str:
 def sources_of(file: Path) -> list[Path]:
     """Return the files that a robot is read from: itself and its meshes, where they are found."""
     meshes = [one.get("filename", "") for one in safe_xml(file).getroot().iter("mesh")]
-    found = (mesh_path(file, name) for name in meshes)
-    return [file, *(path for path in found if path is not None)]
+    result = (mesh_path(file, name) for name in meshes)
+    return [file, *(path for path in result if path is not None)]
 
 
 def mesh_path(file: Path, name: str, package_path: Sequence[Path] = ()) -> Path | None:

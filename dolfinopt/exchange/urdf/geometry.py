@@ -133,8 +133,8 @@ class _Grid:
             origin=[float(x) + 0.5 * self.step for x in self.low],
         )
         surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
-        found = surface.voxelize_binary_mask(reference_volume=image)["mask"]
-        return np.asarray(found).reshape(self.shape, order="F") > 0
+        result = surface.voxelize_binary_mask(reference_volume=image)["mask"]
+        return np.asarray(result).reshape(self.shape, order="F") > 0
 
     def passed_by(self, surface: Trimesh) -> np.ndarray:
         """Return True for the voxels that a surface passes."""
@@ -144,9 +144,9 @@ class _Grid:
         places = np.vstack([sample_surface(surface, count, seed=0)[0], surface.vertices])
         inside = np.floor((places - self.low) / self.step).astype(int)
         inside = inside[((inside >= 0) & (inside < self.shape)).all(axis=1)]
-        found = np.zeros(self.shape, dtype=bool)
-        found[tuple(inside.T)] = True
-        return found
+        result = np.zeros(self.shape, dtype=bool)
+        result[tuple(inside.T)] = True
+        return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,14 +166,14 @@ class _Pieces:
 
     def on(self, grid: _Grid) -> np.ndarray:
         """Return True for the voxels within the geometry."""
-        found = np.zeros(grid.shape, dtype=bool)
+        result = np.zeros(grid.shape, dtype=bool)
         for one in self.closed:
-            found |= grid.filled_by(one)
+            result |= grid.filled_by(one)
         for one in self.hollows:
-            found &= ~grid.filled_by(one)
+            result &= ~grid.filled_by(one)
         if self.open:
-            found |= grid.taken_from(*self._within_open)
-        return found
+            result |= grid.taken_from(*self._within_open)
+        return result
 
     @cached_property
     def _within_open(self) -> tuple[_Grid, np.ndarray]:
@@ -196,14 +196,16 @@ class _Pieces:
 
     def distance(self, points: np.ndarray, near: float) -> np.ndarray:
         """Return the signed distance (n,) from closed pieces, positive outside, m; far: `near`."""
-        found = np.full(len(points), near)
+        result = np.full(len(points), near)
         for pieces, sign in ((self.closed, 1.0), (self.hollows, -1.0)):
-            for one in pieces:
-                low, high = one.bounds
+            for piece in pieces:
+                low, high = piece.bounds
                 at = ((points > low - near) & (points < high + near)).all(axis=1)
-                own = sign * _distance(one, points[at])
-                found[at] = np.minimum(found[at], own) if sign > 0 else np.maximum(found[at], own)
-        return found
+                own = sign * _distance(piece, points[at])
+                result[at] = (
+                    np.minimum(result[at], own) if sign > 0 else np.maximum(result[at], own)
+                )
+        return result
 
 
 def _distance(closed: Trimesh, points: np.ndarray) -> np.ndarray:
@@ -213,8 +215,8 @@ def _distance(closed: Trimesh, points: np.ndarray) -> np.ndarray:
     if not len(points):
         return np.zeros(0)
     surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
-    found = pyvista.PolyData(points).compute_implicit_distance(surface)
-    return np.asarray(found["implicit_distance"])
+    result = pyvista.PolyData(points).compute_implicit_distance(surface)
+    return np.asarray(result["implicit_distance"])
 
 
 def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCells:
@@ -314,13 +316,13 @@ def _tidy(shape: Trimesh, to_arm: np.ndarray) -> Trimesh:
     """Return a surface in the arm's frame: corners merged, no triangle twice or without area."""
     import trimesh
 
-    found = trimesh.Trimesh(shape.vertices, shape.faces, process=True)
-    found.merge_vertices(merge_tex=True, merge_norm=True)
-    found.update_faces(found.nondegenerate_faces())
-    found.update_faces(found.unique_faces())
-    found.remove_unreferenced_vertices()
-    found.apply_transform(to_arm)
-    return found
+    result = trimesh.Trimesh(shape.vertices, shape.faces, process=True)
+    result.merge_vertices(merge_tex=True, merge_norm=True)
+    result.update_faces(result.nondegenerate_faces())
+    result.update_faces(result.unique_faces())
+    result.remove_unreferenced_vertices()
+    result.apply_transform(to_arm)
+    return result
 
 
 def _lies_in_another(one: Trimesh, pieces: Sequence[Trimesh]) -> bool:
@@ -375,16 +377,16 @@ def _region(
     pieces: _Pieces, grid: _Grid, ends: tuple[float, float] | None
 ) -> tuple[np.ndarray, float]:
     """Return the largest piece between the ends on a grid, and its share of what is there."""
-    found = pieces.on(grid)
+    result = pieces.on(grid)
     if ends is not None:
         x = grid.low[0] + (np.arange(grid.shape[0]) + 0.5) * grid.step
-        found[(x < ends[0]) | (x > ends[1])] = False
-    if not found.any():
+        result[(x < ends[0]) | (x > ends[1])] = False
+    if not result.any():
         if ends is None:
             raise NoSolid("its geometry encloses nothing")
-        return found, 0.0
-    largest = _connected(found)
-    return largest, float(largest.sum() / found.sum())
+        return result, 0.0
+    largest = _connected(result)
+    return largest, float(largest.sum() / result.sum())
 
 
 def _connected(found: np.ndarray) -> np.ndarray:
@@ -444,11 +446,11 @@ def _largest(pieces: _Pieces) -> _Piece:
         grid = _grid(box[0], box[1], size / COARSE)
         region, now = _region(pieces, grid, None)
         share = min(share, now)
-        found = _piece(region, share, grid, box)
-        if found.size > 0.7 * size:
+        result = _piece(region, share, grid, box)
+        if result.size > 0.7 * size:
             break
-        box = found.box
-    return found
+        box = result.box
+    return result
 
 
 def _between(pieces: _Pieces, whole: _Piece, ends: tuple[float, float]) -> _Piece | None:
@@ -509,10 +511,10 @@ def _cells(
     if ends is not None:
         flat = axes == 0
         x = points[facets].mean(axis=1)[:, 0]
-        patches = [facets[flat & (np.abs(x - one) < 1e-6 * side)] for one in ends]
+        patches = [facets[flat & (np.abs(x - end) < 1e-6 * side)] for end in ends]
     else:
         patches = _nearest(points, facets, length)
-    held = [np.unique(one) for one in patches]
+    held = [np.unique(patch) for patch in patches]
     points = _on_surface(pieces, points, cells, facets, region, fine, held, ends is not None)
     return LinkCells(points, cells, patches[0], patches[1], side, tuple(notes))
 
@@ -521,29 +523,29 @@ def _facets(solid: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Return the outer facets (k, 4) of the cells of a grid, and the axis across each (k,)."""
     where = np.argwhere(solid)
     around = np.pad(solid, 1)
-    found, axes = [], []
+    result, axes = [], []
     for (axis, way), side in SIDES.items():
         beside = where + 1
         beside[:, axis] += way
         outer = ~around[tuple(beside.T)]
-        found.append(cells[outer][:, side])
+        result.append(cells[outer][:, side])
         axes.append(np.full(outer.sum(), axis))
-    return np.concatenate(found), np.concatenate(axes)
+    return np.concatenate(result), np.concatenate(axes)
 
 
 def _nearest(points: np.ndarray, facets: np.ndarray, length: float) -> list[np.ndarray]:
     """Return the outer facets nearest to each joint, without common points."""
     middles = points[facets].mean(axis=1)
     away = np.stack([np.linalg.norm(middles - [x, 0.0, 0.0], axis=1) for x in (0.0, length)])
-    count, found = max(4, math.ceil(PATCH * len(facets))), []
+    count, result = max(4, math.ceil(PATCH * len(facets))), []
     for own, other in (away, away[::-1]):
         mine = np.flatnonzero(own <= other)
-        found.append(facets[mine[np.argsort(own[mine], kind="stable")[:count]]])
-    shared = np.intersect1d(found[0], found[1])
-    found[1] = found[1][~np.isin(found[1], shared).any(axis=1)]
-    if not all(map(len, found)):
+        result.append(facets[mine[np.argsort(own[mine], kind="stable")[:count]]])
+    shared = np.intersect1d(result[0], result[1])
+    result[1] = result[1][~np.isin(result[1], shared).any(axis=1)]
+    if not all(map(len, result)):
         raise NoSolid("both joints are nearest to the same place of its geometry")
-    return found
+    return result
 
 
 def _on_surface(

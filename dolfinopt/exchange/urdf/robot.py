@@ -144,19 +144,19 @@ class RobotLink:
         """Volume in m3 within its surfaces; within their convex hulls if they are open."""
         from scipy.spatial import QhullError
 
-        found = 0.0
-        for one in self.shapes:
+        result = 0.0
+        for shape in self.shapes:
             try:
-                whole = one if one.is_watertight else one.convex_hull
-                found += abs(float(whole.volume))
+                whole = shape if shape.is_watertight else shape.convex_hull
+                result += abs(float(whole.volume))
             except QhullError:  # a flat one
                 continue
-        return found
+        return result
 
     @cached_property
     def points(self) -> np.ndarray:
         """Corners (n, 3) of its surfaces, m."""
-        return np.vstack([np.zeros((0, 3)), *(one.vertices for one in self.shapes)])
+        return np.vstack([np.zeros((0, 3)), *(shape.vertices for shape in self.shapes)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,19 +193,19 @@ class Robot:
 
     def path(self, link: str) -> tuple[RobotJoint, ...]:
         """Return the joints from the ground to a link."""
-        found: list[RobotJoint] = []
+        result: list[RobotJoint] = []
         while link != self.root:
-            found.insert(0, self.holder[link])
-            link = found[0].parent
-        return tuple(found)
+            result.insert(0, self.holder[link])
+            link = result[0].parent
+        return tuple(result)
 
     def poses(self, q: dict[str, float]) -> dict[str, np.ndarray]:
         """Return the pose of every link's frame in the root's at joint coordinates by name."""
-        found = {self.root: np.eye(4)}
+        poses = {self.root: np.eye(4)}
         for joint in self.joints:
             own = motion_of(joint.kind, joint.axis, q[joint.name]) if joint.moves else np.eye(4)
-            found[joint.child] = found[joint.parent] @ joint.pose @ own
-        return found
+            poses[joint.child] = poses[joint.parent] @ joint.pose @ own
+        return poses
 
 
 # -- frames ----------------------------------------------------------------------------------
@@ -424,7 +424,7 @@ def scene_bodies(
     tool = tool or default_tool(robot, chosen)
     places = places_of(robot, chosen, tool)
     solids = {name: solid_of(robot, name, tool) for name in chosen}
-    found = []
+    bodies = []
     for link, (body, _) in places.items():
         if link != body:
             continue
@@ -439,13 +439,13 @@ def scene_bodies(
         pose, axis = inverse(outboard) @ at @ joint.pose @ frame, frame[:3, :3].T @ joint.axis
         own = (solid.length, solid.size, solid.measured) if solid else ()
         inertia = total.posed(inverse(frame))
-        found.append(SceneBody(link, links, joint, parent, frame, pose, axis, inertia, *own))
-    if any(one.parent == tool for one in found):
+        bodies.append(SceneBody(link, links, joint, parent, frame, pose, axis, inertia, *own))
+    if any(one.parent == tool for one in bodies):
         # A body without mass at the outboard interface of a tool on which others hang.
         name, still = f"{tool}_end", np.eye(4)
         joint = RobotJoint(name, "fixed", tool, name, still, still[0, :3])
-        return (*found, SceneBody(name, (), joint, tool, still, still, joint.axis, MASSLESS))
-    return tuple(sorted(found, key=lambda one: one.link == tool))
+        return (*bodies, SceneBody(name, (), joint, tool, still, still, joint.axis, MASSLESS))
+    return tuple(sorted(bodies, key=lambda one: one.link == tool))
 
 
 def _check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> None:
@@ -562,7 +562,7 @@ def read_loops(
     for name in passive if isinstance(passive, list) else [passive]:
         if name not in joints:
             raise _refused(file, "passive", name, f"expected joints that move: {', '.join(joints)}")
-    reader = _Reader(file, places, {one.link: one for one in bodies})
+    reader = _Reader(file, places, {body.link: body for body in bodies})
     closures, rods = [], []
     interfaces: dict[str, list[tuple[str, np.ndarray]]] = {}
     for k, one in enumerate(data.get("closures", [])):
@@ -636,8 +636,8 @@ class _Reader:
         one = self.bodies[body]
         end = one.frame.copy()
         end[:3, 3] += one.length * end[:3, 0]
-        found = inverse(end) @ pose @ at
-        if np.linalg.norm(found[:3, 3]) > SAME_PLACE:
+        result = inverse(end) @ pose @ at
+        if np.linalg.norm(result[:3, 3]) > SAME_PLACE:
             raise _refused(
                 self.file,
                 key,
@@ -645,7 +645,7 @@ class _Reader:
                 "expected a rigid link, or the point where the solid's next joint is, its "
                 "interface; give the scene more by hand, [[arms.interfaces]]",
             )
-        return body, found
+        return body, result
 
 
 def _is_list(value: Any, count: int, kind: Any) -> bool:

@@ -63,7 +63,7 @@ def scene_names(names: Iterable[str]) -> dict[str, str]:
 
     Letters, digits, _, - stay; what else there is becomes _.
     """
-    found: dict[str, str] = {}
+    result: dict[str, str] = {}
     taken = {GROUND, "t"}
     for name in names:
         word = re.sub(r"[^A-Za-z0-9_-]", "_", name)[: LONGEST_NAME - 4].lstrip("-") or "_"
@@ -73,8 +73,8 @@ def scene_names(names: Iterable[str]) -> dict[str, str]:
             count += 1
             unique = f"{word}_{count}"
         taken.add(unique.casefold())
-        found[name] = unique
-    return found
+        result[name] = unique
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +121,8 @@ class RobotScene:
             lines += ["", *(self._solid(body) if body.is_solid else self._rigid(body))]
         for body in self.bodies:
             lines += ["", *self._joint(body)]
-        for one in self.loops.closures:
-            lines += ["", *self._closure(one)]
+        for closure in self.loops.closures:
+            lines += ["", *self._closure(closure)]
         lines += ["", *self._rest()]
         return "\n".join(lines) + "\n"
 
@@ -167,8 +167,8 @@ class RobotScene:
         density is at least `LEAST` and at most 1.
         """
         solids = [_extent(body) for body in self.bodies if body.is_solid]
-        whole = sum(one.volume for one in solids)
-        ends = sum(one.blurred for one in solids)
+        whole = sum(solid.volume for solid in solids)
+        ends = sum(solid.blurred for solid in solids)
         mass = sum(body.inertia.mass for body in self.bodies if body.is_solid)
         wanted = mass / (DENSITY * whole) if mass > 0.0 else FRACTION
         initial = min(1.0, max(LEAST, (wanted * whole - ends) / (whole - ends)))
@@ -337,10 +337,10 @@ def read_origin(table: Path) -> Origin:
     try:
         data = json.loads(record.read_text(encoding="utf-8"))
         solids = data["solids"]
-        frames = {arm: np.array(one["frame"], dtype=float) for arm, one in solids.items()}
+        frames = {arm: np.array(solid["frame"], dtype=float) for arm, solid in solids.items()}
         if any(frame.shape != (4, 4) for frame in frames.values()):
             raise ValueError
-        links = {arm: str(one["link"]) for arm, one in solids.items()}
+        links = {arm: str(solid["link"]) for arm, solid in solids.items()}
         return Origin(record.parent / data["urdf"], links, frames)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(
@@ -457,10 +457,10 @@ def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...
     joints = {joint.name: joint for joint in robot.joints}
     own = [joint.name for joint in robot.movable if joint.mimic is None]
     allowed = f"expected t and any of {', '.join(own)}"
-    found = tuple(name for name in names if name != "t")
+    result = tuple(name for name in names if name != "t")
     if "t" not in names:
         raise InputError(f"{file}: no column t, the instants in s; {allowed}")
-    for name in found:
+    for name in result:
         if name in own:
             continue
         what = "this joint is fixed"
@@ -469,7 +469,7 @@ def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...
         elif joint.mimic is not None:
             what = f"this joint follows {joint.mimic.joint!r}"
         raise InputError(f"{file}: column {name!r}: {what}; {allowed}")
-    return found
+    return result
 
 
 def _complete(
@@ -511,15 +511,15 @@ def _check_positions(robot: Robot, file: str, lines: Sequence[int], rows: np.nda
 
 def _too_fast(robot: Robot, file: str, rates: np.ndarray) -> list[str]:
     """Return a sentence for every joint whose rate (n, joints) exceeds its limit."""
-    found = []
+    result = []
     for joint, values in zip(robot.movable, np.abs(rates).T, strict=True):
         fastest = float(values.max(initial=0.0))
         if fastest > (1.0 + LIMIT_ROUNDING) * joint.velocity:
-            found.append(
+            result.append(
                 f"{file}: joint {joint.name} moves at up to {fastest:.4g} {_unit(joint)}/s, beyond "
                 f"its limit of {joint.velocity:.4g} {_unit(joint)}/s"
             )
-    return found
+    return result
 
 
 def _unit(joint: RobotJoint) -> str:
@@ -563,7 +563,7 @@ def scene_of_robot(
     warn([*said, *implausible_inertias(robot)])
     if write_mesh is not None:
         bodies = tuple(
-            _meshed(robot, one, write_mesh, warn) if one.is_solid else one for one in bodies
+            _meshed(robot, body, write_mesh, warn) if body.is_solid else body for body in bodies
         )
     start_joints = tuple(map(float, rows[0, : len(robot.movable)]))
     return RobotScene(robot, bodies, float(t[-1]), loops, start_joints), t, rows

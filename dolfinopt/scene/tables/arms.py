@@ -664,17 +664,17 @@ class Arm(Table):
     @property
     def further_interfaces(self) -> tuple[Interface, ...]:
         """Return the outboard interfaces besides the arm's end."""
-        return tuple(one for one in self.interfaces if not one.is_end)
+        return tuple(interface for interface in self.interfaces if not interface.is_end)
 
     def end_bore(self, name: str) -> Interface | None:
         """Return the bore at an end of a mesh file's arm, "inboard" or "outboard"; None: none."""
-        return next((one for one in self.interfaces if one.is_end == name), None)
+        return next((interface for interface in self.interfaces if interface.is_end == name), None)
 
     @property
     def interface_points(self) -> tuple[Point, ...]:
         """Return the reference points of all outboard interfaces in the arm's frame, m."""
         return (self.length, 0.0, 0.0), *(
-            in_frame(self, one.point) for one in self.further_interfaces
+            in_frame(self, interface.point) for interface in self.further_interfaces
         )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:

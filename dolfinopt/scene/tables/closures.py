@@ -156,7 +156,7 @@ class Closures(Table):
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
         taken = [joint.name for joint in scene.joints]
-        taken += [one.name for one in scene.closures[: at[-1]]]
+        taken += [closure.name for closure in scene.closures[: at[-1]]]
         if self.name.casefold() in map(str.casefold, taken):
             raise Refusal("expected a name that no joint or other closure has", ".name")
         self._check_ends(scene)
@@ -313,21 +313,21 @@ def take_old_keys(tree: dict[str, Any], table: Any, source: str) -> None:
     tree[OLD] = True  # messages name its keys
     last = [arm.get("name") for arm in _rows(tree, "arms")][-1:]
     tree["closures"] = tree.get("closures") or [{"name": OLD, "between": [*last, GROUND]}]
-    for one in _rows(tree, "closures")[:1]:
-        before = _unit(one.get("axis"))
-        one.update({"axis" if key == "direction" else key: x for key, x in table.items()})
-        load = one.pop("force", None)
-        if one.get("kind") == "slider":
-            one.setdefault("axis", [1.0, 0.0])
-        elif one.get("axis") == [1.0, 0.0]:
-            del one["axis"]  # the default of a line
+    for row in _rows(tree, "closures")[:1]:
+        before = _unit(row.get("axis"))
+        row.update({"axis" if key == "direction" else key: x for key, x in table.items()})
+        load = row.pop("force", None)
+        if row.get("kind") == "slider":
+            row.setdefault("axis", [1.0, 0.0])
+        elif row.get("axis") == [1.0, 0.0]:
+            del row["axis"]  # the default of a line
         if load and not _old_forces(tree):
             tree["forces"] = [*(tree.get("forces") or []), {"name": OLD, "arm": last[0]}]
         for force in _old_forces(tree):
             if load is not None:
                 force["factor"] = load
             if load is not None or force.get("force") == before:
-                force["force"] = _unit(one.get("axis"))
+                force["force"] = _unit(row.get("axis"))
 
 
 def _old_forces(tree: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -78,7 +78,7 @@ def site_of(text: str) -> tuple[str, str]:
 
 def interface_number(arm: Arm, name: str) -> int | None:
     """Return 0 for the outboard interface, 1 ... for further ones; None for another name."""
-    names = [OUTBOARD, *(one.name.casefold() for one in arm.further_interfaces)]
+    names = [OUTBOARD, *(interface.name.casefold() for interface in arm.further_interfaces)]
     return names.index(name.casefold()) if name.casefold() in names else None
 
 
@@ -117,22 +117,22 @@ def check_interfaces(scene: Scene, index: int) -> None:
     if arm.pattern is not None:
         raise Refusal("expected none with pattern", ".interfaces", ".pattern")
     celled = arm.flexible and arm.cells is not None
-    known = [one.name.casefold() for one in arm.interfaces]
-    for k, one in enumerate(arm.interfaces):
+    known = [interface.name.casefold() for interface in arm.interfaces]
+    for k, interface in enumerate(arm.interfaces):
         here = f".interfaces.{k}"
-        if one.name.casefold() in known[:k]:
+        if interface.name.casefold() in known[:k]:
             raise Refusal("expected a name that no other interface of the arm has", f"{here}.name")
-        if one.axis is not None and (arm.mesh is None or not arm.flexible):
+        if interface.axis is not None and (arm.mesh is None or not arm.flexible):
             raise Refusal("expected only with a mesh file, whose bore it is", f"{here}.axis")
-        if (one.radius is None) == (celled or one.axis is not None):
+        if (interface.radius is None) == (celled or interface.axis is not None):
             made = "a rigid arm" if arm.rigid else "an arm made of cells"
             if arm.sid is not None:
-                made = f'a body from a file, which has a node "{one.name}"'
+                made = f'a body from a file, which has a node "{interface.name}"'
             elif not arm.rigid and arm.cells is None:
-                made = f'a mesh file, which has faces in a group "{one.name}"'
-            if one.axis is not None:
+                made = f'a mesh file, which has faces in a group "{interface.name}"'
+            if interface.axis is not None:
                 made = "the axis of a bore"
-            expected = "a number > 0 [m]" if one.radius is None else "none"
+            expected = "a number > 0 [m]" if interface.radius is None else "none"
             raise Refusal(f"expected {expected} with {made}", f"{here}.radius")
 
 
@@ -165,7 +165,7 @@ def check_bores(arm: Arm) -> None:
     Raises:
         Refusal: its keys are paths from the arm.
     """
-    ends = {one.name.strip().casefold(): k for k, one in enumerate(arm.interfaces)}
+    ends = {interface.name.strip().casefold(): k for k, interface in enumerate(arm.interfaces)}
     bores = [ends[name] for name in (INBOARD, OUTBOARD) if name in ends]
     for k in bores:
         at = f"interfaces.{k}"
@@ -448,7 +448,7 @@ def _check_in_space(arm: Arm, index: int, number: int, joint: Joint) -> None:
 def joint_parts(scene: Scene) -> tuple[JointParts, ...]:
     """Return the parts of every arm's inboard joint, in the arms' order."""
     joints = {joint.child: joint for joint in scene.joints}
-    found = []
+    parts = []
     for arm in scene.arms:
         part = partial(_part, arm, joints.get(arm.name))
         bearing = friction = None
@@ -458,5 +458,5 @@ def joint_parts(scene: Scene) -> tuple[JointParts, ...]:
             friction = (*part("friction"), part("friction_speed"))
         gear = part("gear_stiffness"), part("gear_damping")
         motor = part("rotor_inertia"), part("gear_ratio") or 1.0
-        found.append(JointParts(*gear, *motor, bearing, friction))
-    return tuple(found)
+        parts.append(JointParts(*gear, *motor, bearing, friction))
+    return tuple(parts)

@@ -303,7 +303,9 @@ class Control(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse gains and limits that are not one for every driven coordinate."""
-        if self.feed_forward == "elastic" and not any(one.stiffness for one in joint_parts(scene)):
+        if self.feed_forward == "elastic" and not any(
+            part.stiffness for part in joint_parts(scene)
+        ):
             raise Refusal(
                 'expected "rigid": no joint has a gear that gives way; state gear_stiffness',
                 ".feed_forward",
@@ -442,7 +444,7 @@ class Force(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what acts nowhere, has another dimension, or a key that nothing uses."""
-        if self.name and self.name in [one.name for one in scene.forces[: at[-1]]]:
+        if self.name and self.name in [force.name for force in scene.forces[: at[-1]]]:
             raise Refusal("expected a name that no other force has", ".name")
         check_site(scene, self.arm, ".arm")
         where = "with [[joints]]" if scene.is_spatial else "without [[joints]]: in the plane"

@@ -325,8 +325,8 @@ class ConstraintOptions(Table):
 
     def limit(self, key: str) -> float | None:
         """Return the limit of a response that has one for all its values, None without one."""
-        found = self.limits.get(key)
-        return found if isinstance(found, float) else None
+        result = self.limits.get(key)
+        return result if isinstance(result, float) else None
 
     def pole_instants(self, motion: Motion) -> tuple[float, ...]:
         """Return the instants at which poles count, s."""
@@ -343,8 +343,8 @@ class ConstraintOptions(Table):
         }
         for key, names in owners.items():
             refuse_count(getattr(self, key), names, f".{key}")
-        for index, one in enumerate(vars(self)["stiffness"] or ()):
-            one.check_at(scene, (*at, "stiffness", index))
+        for index, var in enumerate(vars(self)["stiffness"] or ()):
+            var.check_at(scene, (*at, "stiffness", index))
         self._check_delay(scene.motion)
         self._check_poles(scene)
         self._check_arms(scene)

@@ -462,4 +462,4 @@ def unused_options(scene_options: Iterable[str], kind: str, limited: Iterable[st
     used = {*DECLARED[kind].options}
     for key in limited:
         used |= {*limited_by(key).limit_options}
-    return [one for one in scene_options if any(users_of(one)) and one not in used]
+    return [option for option in scene_options if any(users_of(option)) and option not in used]
