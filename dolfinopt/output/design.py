@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -446,79 +446,57 @@ VTK_CELLS = {(2, 3): 5, (2, 4): 9, (3, 4): 10, (3, 8): 12}
 
 
 def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
-    """Write design.vtu: density, arm and, if known, stress by cell, see `_Sheet`.
+    """Write design.vtu: density, arm and, if known, stress and thickness of the wall by cell.
 
-    One grid, because few programs read collections. Without a designed arm it is not written.
+    All designed arms are one grid, as few programs read collections, one below the other, in m;
+    without one it is not written.
     """
-    if designed(views):
-        _write_vtu(folder / "design.vtu", _sheet(views))
+    if not (arms := designed(views)):
+        return
+    points, cells, offset, count = [], [], 0.0, 0
+    for view in arms:
+        own, corners = _merge_corners(view.corners)
+        points.append(np.pad(own, ((0, 0), (0, 3 - own.shape[1]))) + np.array([0.0, offset, 0.0]))
+        cells.append(corners + count)
+        offset -= 2.0 * np.ptp(own[:, 1])
+        count += len(own)
+    numbers = [k for k, view in enumerate(views) if view.designed]
+    fields: dict[str, list[Any]] = {
+        "density": [view.density for view in arms],
+        "arm": [np.full(len(view.density), k) for k, view in zip(numbers, arms, strict=True)],
+        "stress": [view.stress for view in arms],
+        "wall": [view.wall for view in arms],
+    }
+    known = {k: values for k, values in fields.items() if all(x is not None for x in values)}
+    kinds = [VTK_CELLS[view.corners.shape[2], view.corners.shape[1]] for view in arms]
+    _write_vtu(folder / "design.vtu", np.vstack(points), cells, kinds, known)
 
 
-@dataclass(frozen=True, eq=False)
-class _Sheet:
-    """All designed arms as one grid, one below the other, in m."""
-
-    points: np.ndarray  # (n_points, 3)
-    cells: list[np.ndarray]  # (n_cells, corners) points around each cell, an array an arm
-    density: np.ndarray  # (all cells,)
-    arm: np.ndarray  # (all cells,) number of the arm, from 0 in the scene's order
-    # (all cells,) largest von Mises stress along the motion, Pa, or None
-    stress: np.ndarray | None = None
-    dimension: int = 2  # of the cells, 2 or 3
-    # (all cells,) thickness of the wall where arms are hollow, m, or None
-    wall: np.ndarray | None = None
-
-    @property
-    def fields(self) -> dict[str, np.ndarray]:
-        """What every cell has, by name."""
-        result = {"density": self.density, "arm": self.arm}
-        more = {"stress": self.stress, "wall": self.wall}
-        return result | {name: values for name, values in more.items() if values is not None}
-
-
-def _sheet(views: Sequence[ArmView]) -> _Sheet:
-    points, cells, arm = [], [], []
-    offset, count = 0.0, 0
-    for index, view in enumerate(views):
-        if view.designed:
-            own, corners = _merge_corners(view.corners)
-            depth = own[:, 2] if own.shape[1] == 3 else np.zeros(len(own))
-            points.append(np.column_stack([own[:, 0], own[:, 1] + offset, depth]))
-            cells.append(corners + count)
-            arm.append(np.full(len(corners), index))
-            offset -= 2.0 * np.ptp(own[:, 1])
-            count += len(own)
-    density = np.concatenate([view.density for view in designed(views)])
-
-    def whole(parts: Iterator[np.ndarray | None]) -> np.ndarray | None:
-        known = [part for part in parts if part is not None]
-        return np.concatenate(known) if len(known) == len(cells) else None
-
-    stress = whole(view.stress for view in designed(views))
-    wall = whole(view.wall for view in designed(views))
-    dimension = designed(views)[0].corners.shape[2]
-    arms = np.concatenate(arm)
-    return _Sheet(np.vstack(points), cells, density, arms, stress, dimension, wall)
-
-
-def _write_vtu(path: Path, sheet: _Sheet) -> None:
+def _write_vtu(
+    path: Path,
+    points: np.ndarray,
+    cells: Sequence[np.ndarray],
+    kinds: Sequence[int],
+    fields: Mapping[str, Any],
+) -> None:
+    """Write points (n, 3) and blocks of cells (m, corners), VTK's kind and fields of each."""
     # VTK's own modules: PyVista takes 0.3 s more to import.
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    grid, points, cells = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
-    points.SetData(numpy_to_vtk(sheet.points, deep=True))
-    grid.SetPoints(points)
-    corners = np.concatenate([np.full(len(part), part.shape[1]) for part in sheet.cells])
-    offsets = np.concatenate([[0], np.cumsum(corners)])
-    connectivity = np.concatenate([part.ravel() for part in sheet.cells])
-    cells.SetData(*(numpy_to_vtkIdTypeArray(x, deep=True) for x in (offsets, connectivity)))
-    types = [np.full(len(part), VTK_CELLS[sheet.dimension, part.shape[1]]) for part in sheet.cells]
-    grid.SetCells(numpy_to_vtk(np.concatenate(types).astype(np.uint8), deep=True), cells)
-    for name, values in sheet.fields.items():
-        array = numpy_to_vtk(values, deep=True)
+    grid, places, blocks = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
+    places.SetData(numpy_to_vtk(points, deep=True))
+    grid.SetPoints(places)
+    counts = np.concatenate([np.full(len(block), block.shape[1]) for block in cells])
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    connectivity = np.concatenate([block.ravel() for block in cells])
+    blocks.SetData(*(numpy_to_vtkIdTypeArray(x, deep=True) for x in (offsets, connectivity)))
+    types = np.repeat(np.array(kinds, dtype=np.uint8), [len(block) for block in cells])
+    grid.SetCells(numpy_to_vtk(types, deep=True), blocks)
+    for name, values in fields.items():
+        array = numpy_to_vtk(np.concatenate(values), deep=True)
         array.SetName(name)
         grid.GetCellData().AddArray(array)
     grid.GetCellData().SetActiveScalars("density")

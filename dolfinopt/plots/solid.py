@@ -20,14 +20,10 @@ from dolfinopt.part.solid.surface import Surface, surface_at
 from dolfinopt.plots.design import bounds
 from dolfinopt.plots.poses import box_corners
 from dolfinopt.plots.style import (
-    DPI,
     GREY,
     MILLI,
-    TITLE,
     Box,
-    new_figure,
     stacked_axes,
-    styled,
     ticks,
 )
 
@@ -47,7 +43,6 @@ EDGE = 35.0  # degrees between faces from which an edge stays sharp
 SHADED = {"smooth_shading": True, "split_sharp_edges": True, "feature_angle": EDGE, "ambient": 0.3,
           "diffuse": 0.85, "specular": 0.1}  # fmt: skip
 PLAIN = {"show_scalar_bar": False, "reset_camera": False, "render": False}
-COLUMN = 6.0  # inches, of links side by side
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,41 +181,6 @@ def draw_triad(axes: Axes, camera: Camera, at: np.ndarray, length: float) -> Non
         axes.text(x, y, name, ha="center", va="center", fontsize=9)
 
 
-@styled
-def solid_designs_figure(
-    labels: Sequence[str], rows: Sequence[Sequence[ArmView]], title: str
-) -> Figure:
-    """Return the picture of several designs to one scale: a row a design, links side by side.
-
-    Args:
-        labels: of the designs.
-        rows: links of each.
-        title: above the picture.
-    """
-    columns = max(map(len, rows))
-    spans = np.array([np.subtract(*_seen(bounds(v))[::-1]) for row in rows for v in row])
-    wide, tall = spans.max(axis=0)
-    height = len(rows) * (tall / wide * COLUMN + 0.5) + 0.6
-    figure = new_figure(COLUMN * columns + 0.4, height, laid_out=True)
-    grid = figure.subplots(len(rows), columns, squeeze=False)
-    for axes, row, label in zip(grid, rows, labels, strict=True):
-        for panel in axes:
-            panel.set(xlim=(0.0, wide), ylim=(0.0, tall), aspect="equal")
-            panel.set_axis_off()
-        for panel, view in zip(axes, row):
-            low, high = _seen(bounds(view))
-            studio = Studio(LINKS, low, high, COLUMN * DPI / wide)
-            studio.solid(material(view), color=STEEL)
-            _draw_edges(studio, bounds(view))
-            studio.low, studio.high = low - low, high - low
-            studio.show(panel, studio.close())
-            panel.set(xlim=(0.0, wide), ylim=(0.0, tall))
-            panel.set_title(view.name, loc="right", color=GREY)
-        axes[0].set_title(label)
-    figure.suptitle(title, x=0.01, ha="left", fontsize=TITLE)
-    return figure
-
-
 def solid_parts_figure(
     parts: Sequence[SolidPart | HollowPart], title: str, masses: Sequence[float]
 ) -> Figure:
@@ -293,17 +253,12 @@ def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: 
     studio = Studio(LINKS, *_seen(box), scale)
     studio.solid(surface, **look)
     if edges:
-        _draw_edges(studio, box)
+        lines = pyvista.Box([value for pair in zip(*box) for value in pair])
+        studio.plotter.add_mesh(lines, style="wireframe", color=GREY, lighting=False, **PLAIN)
     studio.show(axes, studio.close())
     axes.axis(limits)
     axes.set_axis_off()
     _draw_ruler(axes, *box, scale)
-
-
-def _draw_edges(studio: Studio, box: Box) -> None:
-    low, high = box
-    lines = pyvista.Box([value for pair in zip(low, high) for value in pair])
-    studio.plotter.add_mesh(lines, style="wireframe", color=GREY, lighting=False, **PLAIN)
 
 
 def _draw_ruler(axes: Axes, low: np.ndarray, high: np.ndarray, scale: float) -> None:

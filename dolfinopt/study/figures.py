@@ -187,23 +187,16 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
 # -- designs ---------------------------------------------------------------------------------
 
 
-@style.styled
 def design_figure(figure: tables.DesignFigure) -> Figure:
     """Return the designs below each other, to one scale."""
-    views = [designed(read_views(scene, path)) for _, scene, path in figure.designs]
-    labels = [label for label, _, _ in figure.designs]
-    if figure.designs[0][1].dimension == 3:  # PyVista is imported where solids are drawn
-        from dolfinopt.plots.solid import solid_designs_figure
-
-        return solid_designs_figure(labels, views, figure.title)
     from dolfinopt.plots import design
 
     every = [
         replace(view, name=f"{label}: {view.name}")
-        for label, row in zip(labels, views, strict=True)
-        for view in row
+        for label, scene, path in figure.designs
+        for view in designed(read_views(scene, path))
     ]
     drawn = design.design_figure(every, figure.title)
     for axes, view in zip(drawn.axes, every):  # all arms have one size
-        axes.set_title(view.name)
+        axes.set_title(view.name, loc="left", y=1.0)
     return drawn

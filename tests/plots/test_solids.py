@@ -71,8 +71,6 @@ def test_picture_of_a_link():
     assert (places[:, 1] < np.linspace(*edge[:, 1], 11)).all()
     box = figure.get_tightbbox()
     assert box.x0 >= 0.0 and box.x1 <= figure.get_figwidth()
-    several = solid.solid_designs_figure(["a", "b"], [[view], [view, view]], "two")
-    assert sum(bool(axes.images) for axes in several.axes) == 3
 
 
 def test_surface_carries_fields_and_cells():
