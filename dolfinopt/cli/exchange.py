@@ -266,8 +266,7 @@ def import_robot(
     TABLE is a CSV file, t in s and a column for each joint, rad or m. The LINKs become solids in
     their own shape, mended where it must be, or boxes to edit where there is none. The others are
     rigid. Packages of package:// are looked for in ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the
-    folders above ROBOT. Inertias that cannot be are told, and so are joints
-    beyond their limits.
+    folders above ROBOT. Impossible inertias and joints beyond their limits are reported.
     """
     table, *names = [*([] if trajectory is None else [trajectory]), *words, links]
     chosen = tuple(name for word in ",".join(names).split(",") if (name := word.strip()))
@@ -620,8 +619,8 @@ FORMATS = {
     "--below",
     type=click.FloatRange(min=0.0, min_open=True),
     metavar="HZ",
-    help="of state-space: poles below this frequency hold 1 %; the arms take as many coordinates "
-    "as that needs; default: those of the scene",
+    help="of state-space: take as many coordinates as poles below this frequency need to be within "
+    "1 %; default: those of the scene",
 )
 @old_option("--urdf", now="export RUN robot", is_flag=True)
 @old_option("--state-space", "instant", now="export SCENE state-space T", type=float)
@@ -648,7 +647,7 @@ def export(
 
     Bodies are standard input data (ARM.sid, the same as ARM.sid.npz) and for MBDyn (ARM.fem), with
     geometric stiffness where simulation.stiffening is true, or "auto" and the motion asks for it.
-    With [[joints]] in space; of rigid arms the screen tells mass, centre and inertia.
+    With [[joints]] in space; of rigid arms mass, centre and inertia are printed.
     """
     if urdf or instant is not None:
         kind = "robot" if urdf else "state-space"

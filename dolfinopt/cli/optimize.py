@@ -206,7 +206,7 @@ def simulate(
 @click.option(
     "--check",
     is_flag=True,
-    help="compare with differences of the whole simulation",
+    help="compare with finite differences of the simulation",
 )
 @overwrite_option
 @set_option
@@ -219,7 +219,7 @@ def gradient(
     overwrite: bool,
     overrides: tuple[str, ...],
 ) -> None:
-    """Write the gradient by the physical densities to FILE."""
+    """Write the gradient with respect to the physical densities to FILE."""
     out = out or Path("results") / f"{scene.stem}-gradient" / "gradient.npz"
     if out.is_dir():
         raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")

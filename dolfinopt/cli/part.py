@@ -39,7 +39,10 @@ if TYPE_CHECKING:
 @click.argument("folder", metavar="DIR", type=PATH)
 @out_option("the files; default: DIR/part")
 @click.option(
-    "--tool-radius", type=float, metavar="M", help="least of concave corners; default: 0.003"
+    "--tool-radius",
+    type=float,
+    metavar="M",
+    help="smallest radius of concave corners; default: 0.003",
 )
 @click.option(
     "--tolerance",
@@ -49,7 +52,7 @@ if TYPE_CHECKING:
 )
 @click.option("--curves", hidden=True, expose_value=False)  # of splines: no effect
 @click.option("--simplify/--no-simplify", hidden=True, expose_value=False)  # no effect
-@click.option("--round", "rounds", is_flag=True, help="radii of whole half millimetres")
+@click.option("--round", "rounds", is_flag=True, help="round radii to multiples of 0.5 mm")
 @click.option(
     "--check/--no-check",
     default=True,
@@ -66,9 +69,7 @@ if TYPE_CHECKING:
 @click.option(
     "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="override a value of [part]"
 )
-@click.option(
-    "--resume", is_flag=True, help="go on with the shapes of an --optimize that was interrupted"
-)
+@click.option("--resume", is_flag=True, help="continue an interrupted --optimize")
 @overwrite_option
 @plots_option
 def part(
@@ -90,12 +91,12 @@ def part(
 
     Each arm as STEP (solid, and its face for arms.mesh), DXF (R2010 and R12), SVG and STL, all in
     millimetres; part.toml is the machine with these parts, to be simulated like any scene. A table
-    tells what it does beside the densities, and beside these cut to solid and void.
+    compares it with the densities, and with these cut to solid and void.
 
-    Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness as
-    STEP and DXF, too, for which --tool-radius, --tolerance and --round are.
+    Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness
+    also as STEP and DXF, to which --tool-radius, --tolerance and --round apply.
 
-    Options go over the table [part] of the scene: "dolfinopt keys part" lists its keys.
+    Options override the table [part] of the scene; "dolfinopt keys part" lists its keys.
     """
     if other := [override for override in overrides if not override.startswith("part.")]:
         raise InputError(f"--set {other[0]}: expected keys of [part], as part.starts=3")

@@ -240,8 +240,8 @@ def compare(
     help="a scene value's distribution: normal:MEAN:DEVIATION, uniform:LOW:HIGH, "
     "triangular:LOW:MODE:HIGH or lognormal:MEDIAN:SIGMA; several are independent",
 )
-@click.option("--samples", type=int, default=1000, show_default=True, help="of the random values")
-@click.option("--seed", type=int, default=1, show_default=True, help="of the samples")
+@click.option("--samples", type=int, default=1000, show_default=True, help="number of samples")
+@click.option("--seed", type=int, default=1, show_default=True, help="seed of the random numbers")
 @designs_option
 @study_command
 def uncertainty(
@@ -277,9 +277,9 @@ def reproduce(
 ) -> None:
     """Recreate figures 3 to 15 of the paper, and a page that compares its statements with ours.
 
-    The exit status is 1 if one of the main statements does not hold. "coarse" takes 100 x 6 cells,
-    a filter of two of them and 60 iterations, a minute; "fitted" a scene whose values that the
-    paper does not state are fitted to its statements: there nothing is demanded.
+    The exit status is 1 if one of the main statements does not hold. Variants: "coarse" takes
+    100 x 6 cells, a filter of two of them and 60 iterations, a minute; "fitted" fits the values
+    that the paper does not state to its statements. Their exit status is 0.
 
     What is computed is kept in DIR/cases and taken from there the next time; a call that was
     interrupted goes on.

@@ -27,7 +27,7 @@ from dolfinopt.plots.style import (
 BASE = "#c9c9c9"  # carts, pedestals and sliders
 UNDESIGNED = "#8a8a8a"  # arms without a design
 SIDES = (0.75, 0.95)  # inches left and right of the axes, for y and for the scale of colours
-ROOM = 0.1  # around what is seen, of the arms' reach: for the instants
+ROOM = 0.13  # around what is seen, of the arms' reach: for the instants
 CART, TOP = np.array([0.06, 0.045]), 0.25  # half width and height of a cart; top of a pedestal
 BLOCK = np.array([0.06, 0.036])  # half length and half height of a slider
 THIN, BAR, DOT = 1.0, 5.0, 5.0  # points: lines, rigid arms, joints

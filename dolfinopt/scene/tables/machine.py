@@ -106,19 +106,19 @@ class Joint(Table):
 
     position_limits: tuple[Coordinate, Coordinate] | None = Field(
         default=None,
-        description="least and largest coordinate, as in URDF; told where the motion exceeds them "
-        "[rad, m]",
+        description="least and largest coordinate, as in URDF; a warning tells where the motion "
+        "exceeds them [rad, m]",
     )
     velocity_limit: Limit | None = Field(
         default=None,
-        description="largest rate of the coordinate either way, as in URDF; told where the motion "
-        "exceeds it [rad/s, m/s]",
+        description="largest rate of the coordinate either way, as in URDF; a warning tells where "
+        "the motion exceeds it [rad/s, m/s]",
     )
     effort_limit: Limit | None = Field(
         default=None,
-        description="largest torque or force of the drive either way, as in URDF; told where the "
-        "motion asks for more. The optimiser minds control.limits and constraints.peak_force "
-        "[N m, N]",
+        description="largest torque or force of the drive either way, as in URDF; a warning tells "
+        "where the motion asks for more. The optimiser keeps control.limits and "
+        "constraints.peak_force [N m, N]",
     )
 
     @property
