@@ -20,7 +20,7 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import Arm
-from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, table_in
+from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, setting, table_in
 from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
@@ -41,41 +41,40 @@ def check_scene_name(name: str) -> str:
 class Scene(Table):
     """A complete, valid scene. Two scenes are equal if all their keys are; `source` is no key."""
 
-    name: Annotated[str, AfterValidator(check_scene_name)] = Field(
-        description="title of the scene; default: the file's name without extension [-]"
+    name: Annotated[str, AfterValidator(check_scene_name)] = setting(
+        "title of the scene; default: the file's name without extension [-]"
     )
-    material: Material = Field(description="the solid material")
+    material: Material = setting("the solid material")
     interpolation: Interpolation = Field(default_factory=Interpolation, description="material law")
-    arms: tuple[Arm, ...] = Field(description="arms from the cart outwards")
-    joints: tuple[Joint, ...] = Field(
-        default=(),
-        description="joints of a machine in space, a tree on the ground; without this table the "
+    arms: tuple[Arm, ...] = setting("arms from the cart outwards")
+    joints: tuple[Joint, ...] = setting(
+        (),
+        "joints of a machine in space, a tree on the ground; without this table the "
         "arms are a chain in the plane",
     )
-    motion: Motion = Field(
-        description="prescribed motion",
-        examples=['[motion] with path = "arc", radius, duration and horizon'],
+    motion: Motion = setting(
+        "prescribed motion", examples=['[motion] with path = "arc", radius, duration and horizon']
     )
-    control: Control | None = Field(
-        default=None,
-        description="feedback control; without this table the rigid coordinates follow the desired "
+    control: Control | None = setting(
+        None,
+        "feedback control; without this table the rigid coordinates follow the desired "
         "motion exactly",
     )
     feed_forward: FeedForward = Field(
         default_factory=FeedForward,
         description="corrections of joints that keep the tip on its path",
     )
-    closures: tuple[Closures, ...] = Field(
-        default=(),
-        description="joints that close loops: in the plane a pin or a slider at the last arm's "
+    closures: tuple[Closures, ...] = setting(
+        (),
+        "joints that close loops: in the plane a pin or a slider at the last arm's "
         "end; without this table the machine is a tree, or a chain",
     )
-    payload: Payload = Field(
-        description="load of the end-effector",
+    payload: Payload = setting(
+        "load of the end-effector",
         examples=["[payload] with mass = 2.0 [kg], or mass = 0.0 without a load"],
     )
-    forces: tuple[Force, ...] = Field(
-        default=(), description="given forces on interfaces of arms; none without this table"
+    forces: tuple[Force, ...] = setting(
+        (), "given forces on interfaces of arms; none without this table"
     )
     damping: Damping = Field(default_factory=Damping, description="structural damping")
     reduction: Reduction = Field(default_factory=Reduction, description="model reduction")
@@ -87,8 +86,8 @@ class Scene(Table):
     design: Design = Field(default_factory=Design, description="design variables")
     optimizer: Optimizer = Field(default_factory=Optimizer, description="optimiser")
     part: Part = Field(default_factory=Part, description="parts for the workshop")
-    scenarios: tuple[Scenario, ...] = Field(
-        default=(), description="scenarios that the objective combines; none: the scene itself"
+    scenarios: tuple[Scenario, ...] = setting(
+        (), "scenarios that the objective combines; none: the scene itself"
     )
 
     _source: str = PrivateAttr("<scene>")

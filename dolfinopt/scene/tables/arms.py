@@ -20,6 +20,7 @@ from dolfinopt.scene.tables.base import (
     Refusal,
     Table,
     Use,
+    setting,
     shown,
     table_in,
 )
@@ -156,132 +157,118 @@ class Arm(Table):
         Use("mesh_size cell_shape mesh_scale", "mesh"),
     )
 
-    name: Annotated[str, AfterValidator(check_arm_name)] = Field(
-        description="unique name, used in files and messages [-]"
+    name: Annotated[str, AfterValidator(check_arm_name)] = setting(
+        "unique name, used in files and messages [-]"
     )
-    length: ArmLength = Field(
-        description="distance from the inboard joint axis to the outboard one, or to the "
+    length: ArmLength = setting(
+        "distance from the inboard joint axis to the outboard one, or to the "
         "end-effector; 0 only of a rigid arm in space [m]"
     )
-    height: Length = Field(description="height in the plane of motion [m]")
-    thickness: Length = Field(description="thickness normal to the plane of motion [m]")
-    cells: tuple[CellCount, CellCount] | tuple[CellCount, CellCount, CellCount] | None = Field(
-        default=(200, 12),
-        description="number of cells along and across a rectangular arm in plane stress; along, "
+    height: Length = setting("height in the plane of motion [m]")
+    thickness: Length = setting("thickness normal to the plane of motion [m]")
+    cells: tuple[CellCount, CellCount] | tuple[CellCount, CellCount, CellCount] | None = setting(
+        (200, 12),
+        "number of cells along and across a rectangular arm in plane stress; along, "
         "over the height and over the thickness of a solid one [-]",
     )
-    mesh: FileName | None = Field(
-        default=None,
-        description="geometry or mesh file (.geo, .msh, .step, of Abaqus and CalculiX "
+    mesh: FileName | None = setting(
+        None,
+        "geometry or mesh file (.geo, .msh, .step, of Abaqus and CalculiX "
         ".inp) in place of cells [-]",
     )
-    mesh_size: Length | None = Field(
-        default=None,
-        description="cell size for a .geo or .step file; default: a .geo file's own; with .step a "
+    mesh_size: Length | None = setting(
+        None,
+        "cell size for a .geo or .step file; default: a .geo file's own; with .step a "
         "twelfth of the height, of solids a quarter of the smaller of height and thickness [m]",
     )
-    cell_shape: CellShape | None = Field(
-        default=None,
-        description="cell shape for a .geo or .step file; hexahedron and tetrahedron make the arm "
+    cell_shape: CellShape | None = setting(
+        None,
+        "cell shape for a .geo or .step file; hexahedron and tetrahedron make the arm "
         "a solid, with a .msh or .inp file, too [-]",
     )
-    interface_offset: Length | None = Field(
-        default=None,
-        description="how far the middles of the interfaces of a solid mesh file, or hull, may lie "
+    interface_offset: Length | None = setting(
+        None,
+        "how far the middles of the interfaces of a solid mesh file, or hull, may lie "
         "from the joints at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: "
         "a twentieth of the larger of height and thickness [m]",
     )
-    mesh_scale: float = Field(
-        default=1.0,
+    mesh_scale: float = setting(
+        1.0,
+        "length of the mesh file's unit: 0.001 of a file in mm; a .step file states its own [m]",
         ge=1e-9,
         le=1e9,
-        description="length of the mesh file's unit: 0.001 of a file in mm; a .step file states "
-        "its own [m]",
     )
-    element: ElementName | None = Field(
-        default=None,
-        description='finite element: "incompatible" are quadrilaterals and hexahedra that bend '
+    element: ElementName | None = setting(
+        None,
+        'finite element: "incompatible" are quadrilaterals and hexahedra that bend '
         "without locking; default: these, quadratic triangles and tetrahedra [-]",
     )
-    passive: float | None = Field(
-        default=None,
-        ge=0,
-        description="length kept solid around both interfaces; default: a quarter of the "
+    passive: float | None = setting(
+        None,
+        "length kept solid around both interfaces; default: a quarter of the "
         "height, at most a tenth of the length; with a mesh file 0, its own groups "
         "[m]",
+        ge=0,
     )
-    symmetric: bool | Literal["z", "yz"] = Field(
-        default=False,
-        description="keep the design symmetric about the arm's axis: true, about y = 0; of a solid "
+    symmetric: bool | Literal["z", "yz"] = setting(
+        False,
+        "keep the design symmetric about the arm's axis: true, about y = 0; of a solid "
         'arm also "z", about z = 0, and "yz", about both [-]',
     )
-    extruded: bool = Field(
-        default=False,
-        description="keep the design of a solid arm made of cells the same over the thickness [-]",
+    extruded: bool = setting(
+        False, "keep the design of a solid arm made of cells the same over the thickness [-]"
     )
-    hollow: bool | SectionOrFile = Field(
-        default=False,
-        description="a thin-walled link of the arm's extents: the outer surface stays, the design "
+    hollow: bool | SectionOrFile = setting(
+        False,
+        "a thin-walled link of the arm's extents: the outer surface stays, the design "
         'is the thickness of the wall; true or "box"; "tube" is round, height = thickness; or a '
         "mesh file (.msh) of a solid whose outer surface the arm has, which every ray from its "
         "axis meets once; in space, with cells = [nx, ny, nz], of which those on the surface count "
         "[-]",
     )
-    wall: WallThickness | None = Field(
-        default=None, description="initial thickness of the wall of a hollow arm [m]"
+    wall: WallThickness | None = setting(None, "initial thickness of the wall of a hollow arm [m]")
+    min_wall: WallThickness | None = setting(
+        None, "least thickness of the wall; default: half of wall [m]"
     )
-    min_wall: WallThickness | None = Field(
-        default=None, description="least thickness of the wall; default: half of wall [m]"
-    )
-    max_wall: WallThickness | None = Field(
-        default=None,
-        description="largest thickness of the wall, also that of the flanges, rings over passive "
+    max_wall: WallThickness | None = setting(
+        None,
+        "largest thickness of the wall, also that of the flanges, rings over passive "
         "at both ends; default: twice wall [m]",
     )
-    ribs: int | None = Field(
-        default=None,
-        ge=0,
-        description="rings of a hollow arm at even distances between its ends, two cells long and "
+    ribs: int | None = setting(
+        None,
+        "rings of a hollow arm at even distances between its ends, two cells long and "
         "as thick as max_wall; default: none [-]",
+        ge=0,
     )
-    design: str | None = Field(
-        default=None, description="name of an earlier arm whose mesh and design this one shares [-]"
+    design: str | None = setting(
+        None, "name of an earlier arm whose mesh and design this one shares [-]"
     )
-    pattern: str | None = Field(
-        default=None,
-        description="name of an earlier arm whose design this one repeats, scaled to its own "
+    pattern: str | None = setting(
+        None,
+        "name of an earlier arm whose design this one repeats, scaled to its own "
         "length and height, cell by cell [-]",
     )
-    rigid: bool = Field(
-        default=False, description="a rigid bar of solid material, not optimised [-]"
-    )
-    mass: float | None = Field(
-        default=None,
+    rigid: bool = setting(False, "a rigid bar of solid material, not optimised [-]")
+    mass: float | None = setting(
+        None,
+        "mass of a rigid arm, its centre halfway; default: that of the solid bar [kg]",
         ge=0,
         le=1e9,
-        description="mass of a rigid arm, its centre halfway; default: that of the solid bar [kg]",
     )
-    inertia: Moment | Tensor | None = Field(
-        default=None,
-        description="moment of inertia of a rigid arm about its centre, in space the tensor xx, "
+    inertia: Moment | Tensor | None = setting(
+        None,
+        "moment of inertia of a rigid arm about its centre, in space the tensor xx, "
         "yy, zz, xy, xz, yz; default: that of a bar of its mass [kg m2]",
     )
-    centre: tuple[Position, Position, Position] | None = Field(
-        default=None,
-        description="centre of mass of a rigid arm in space, in the arm's frame; default: halfway "
-        "[m]",
+    centre: tuple[Position, Position, Position] | None = setting(
+        None, "centre of mass of a rigid arm in space, in the arm's frame; default: halfway [m]"
     )
-    joint_mass: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e9,
-        description="mass at the outboard interface: motor, gearbox, bearing [kg]",
+    joint_mass: float = setting(
+        0.0, "mass at the outboard interface: motor, gearbox, bearing [kg]", ge=0, le=1e9
     )
-    joint_inertia: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e9,
-        description="moment of inertia at the outboard interface [kg m2]",
+    joint_inertia: float = setting(
+        0.0, "moment of inertia at the outboard interface [kg m2]", ge=0, le=1e9
     )
     rotor_inertia: RotorInertia = 0.0
     gear_ratio: GearRatio = None
@@ -291,20 +278,18 @@ class Arm(Table):
     bearing_damping: BearingDamping = None
     friction: Friction = None
     friction_speed: FrictionSpeed = FRICTION_SPEED
-    sid: FileName | None = Field(
-        default=None, description="standard input data file (SID) in place of a geometry [-]"
+    sid: FileName | None = setting(
+        None, "standard input data file (SID) in place of a geometry [-]"
     )
-    material: CatalogueName | None = Field(
-        default=None,
-        description='name of this arm\'s material in the catalogue, e.g. "steel S355"; default: '
+    material: CatalogueName | None = setting(
+        None,
+        'name of this arm\'s material in the catalogue, e.g. "steel S355"; default: '
         "that of [material] [-]",
     )
-    regions: tuple[Region, ...] = Field(
-        default=(), description="parts of the arm that stay solid or void"
-    )
-    interfaces: tuple[Interface, ...] = Field(
-        default=(),
-        description="in space: further outboard interfaces, each with six coordinates, on which "
+    regions: tuple[Region, ...] = setting((), "parts of the arm that stay solid or void")
+    interfaces: tuple[Interface, ...] = setting(
+        (),
+        "in space: further outboard interfaces, each with six coordinates, on which "
         "joints or the payload sit, and the bores at the ends of a mesh file; taken from the arm "
         "whose design this one shares alone, the bores with the mesh of the arm before",
     )

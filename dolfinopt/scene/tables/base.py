@@ -75,6 +75,15 @@ def loc_of(path: str | Loc) -> Loc:
     return tuple(int(part) if part.isdigit() else part for part in path.split("."))
 
 
+def setting(*given: Any, **rules: Any) -> Any:
+    """Return the field of a key: its default, if it has one, and what it means, with the unit.
+
+    Rules are those of pydantic, such as ge and le.
+    """
+    *default, description = given
+    return Field(*default, description=description, **rules)
+
+
 class Use(NamedTuple):
     """Keys of a table that have an effect with some values of another one alone.
 

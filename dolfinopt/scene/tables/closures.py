@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, field_validator, model_validator
 
 from dolfinopt.scene.tables.base import (
     Length,
@@ -16,6 +16,7 @@ from dolfinopt.scene.tables.base import (
     Table,
     Use,
     input_error,
+    setting,
 )
 from dolfinopt.scene.tables.joints import (
     Components,
@@ -66,51 +67,48 @@ class Closures(Table):
         Use("damping", "stiffness"),
     )
 
-    name: Annotated[str, AfterValidator(check_joint_name)] = Field(
-        description="unique name; of a rod without length the column of its length in tables [-]"
+    name: Annotated[str, AfterValidator(check_joint_name)] = setting(
+        "unique name; of a rod without length the column of its length in tables [-]"
     )
-    kind: Kind = Field(
-        description="ball (3 equations), pin about an axis (5), slider along an axis that does not "
+    kind: Kind = setting(
+        "ball (3 equations), pin about an axis (5), slider along an axis that does not "
         "turn (5), universal of two crossing axes (4), or a rod between two balls (1); in the "
         "plane pin (2), or slider that may turn (1) [-]"
     )
-    between: tuple[str, str] = Field(
-        description='what it joins: "arm.interface" or "arm" for its outboard one, then another '
-        'or "ground" [-]'
+    between: tuple[str, str] = setting(
+        'what it joins: "arm.interface" or "arm" for its outboard one, then another or "ground" [-]'
     )
-    point: tuple[Position, Position] | tuple[Position, Position, Position] = Field(
-        default=(0.0, 0.0, 0.0),
-        description="the joint in the frame of the second interface, or in the world's [m]",
+    point: tuple[Position, Position] | tuple[Position, Position, Position] = setting(
+        (0.0, 0.0, 0.0), "the joint in the frame of the second interface, or in the world's [m]"
     )
-    rpy: tuple[Angle, Angle, Angle] = Field(
-        default=(0.0, 0.0, 0.0),
-        description="roll, pitch and yaw of the joint's frame there, as of [[joints]]; zero: "
+    rpy: tuple[Angle, Angle, Angle] = setting(
+        (0.0, 0.0, 0.0),
+        "roll, pitch and yaw of the joint's frame there, as of [[joints]]; zero: "
         "parallel to the first interface's frame [rad]",
     )
-    axis: Line | tuple[Component, Component, Component] | None = Field(
-        default=None,
-        description="of a pin in space, a slider, or the universal joint's axis on the second "
+    axis: Line | tuple[Component, Component, Component] | None = setting(
+        None,
+        "of a pin in space, a slider, or the universal joint's axis on the second "
         "interface, in the joint's frame, of any length [-]",
     )
-    cross_axis: Direction | None = Field(
-        default=None,
-        description="the universal joint's axis on the first interface, across the other one [-]",
+    cross_axis: Direction | None = setting(
+        None, "the universal joint's axis on the first interface, across the other one [-]"
     )
-    length: Length | None = Field(
-        default=None,
-        description="of a rod; default: it is driven, its length a column of the motion's table, "
+    length: Length | None = setting(
+        None,
+        "of a rod; default: it is driven, its length a column of the motion's table, "
         "or what the path asks for [m]",
     )
-    side: Literal[-1, 1] = Field(
-        default=1,
-        description="in the plane: which way the loop is assembled: sign of the last joint's angle "
+    side: Literal[-1, 1] = setting(
+        1,
+        "in the plane: which way the loop is assembled: sign of the last joint's angle "
         "at the start; where that is zero, the stretched way; instead, and in space, "
         "motion.initial_joints says it [-]",
     )
-    stiffness: float = Field(
-        default=0.0, ge=0, le=1e15, description="of a rod that is a spring; 0: it is rigid [N/m]"
+    stiffness: float = setting(
+        0.0, "of a rod that is a spring; 0: it is rigid [N/m]", ge=0, le=1e15
     )
-    damping: Gain = Field(default=0.0, description="of a rod that is a spring [N s/m]")
+    damping: Gain = setting(0.0, "of a rod that is a spring [N s/m]")
 
     @property
     def driven(self) -> bool:

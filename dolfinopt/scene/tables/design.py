@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from dolfinopt.scene.tables.base import (
     MAX_ITERATIONS,
@@ -16,6 +16,7 @@ from dolfinopt.scene.tables.base import (
     Refusal,
     Table,
     Use,
+    setting,
     shown,
 )
 
@@ -39,63 +40,53 @@ class Design(Table):
         Use("shared_volume", "volume_fraction"),
     )
 
-    volume_fraction: float | None = Field(
-        default=0.5,
+    volume_fraction: float | None = setting(
+        0.5,
+        "upper limit of the volume fraction of each arm; where mass is objective or "
+        "limited: none unless stated [-]",
         ge=1e-6,
         le=1,
-        description="upper limit of the volume fraction of each arm; where mass is objective or "
-        "limited: none unless stated [-]",
     )
-    shared_volume: bool = Field(
-        default=False, description="one volume limit for all arms together [-]"
-    )
-    initial: float = Field(default=0.5, ge=1e-6, le=1, description="initial x of every cell [-]")
-    minimum: float = Field(default=1e-3, ge=1e-9, lt=1, description="lower bound of x [-]")
-    filter_radius: float = Field(
-        default=0.0075,
+    shared_volume: bool = setting(False, "one volume limit for all arms together [-]")
+    initial: float = setting(0.5, "initial x of every cell [-]", ge=1e-6, le=1)
+    minimum: float = setting(1e-3, "lower bound of x [-]", ge=1e-9, lt=1)
+    filter_radius: float = setting(
+        0.0075,
+        "radius of the equivalent cone filter; 0: no filter; default: an eighth of the "
+        "height of the lowest arm [m]",
         ge=0,
         le=1e4,
-        description="radius of the equivalent cone filter; 0: no filter; default: an eighth of the "
-        "height of the lowest arm [m]",
     )
-    projection: Projection = Field(
-        default=False,
-        description="projection after the filter: none, Heaviside, or robust (eroded, nominal "
+    projection: Projection = setting(
+        False,
+        "projection after the filter: none, Heaviside, or robust (eroded, nominal "
         "and dilated designs together) [-]",
     )
-    sharpness: float = Field(
-        default=128.0, ge=1, le=1e4, description="final beta of the projection [-]"
+    sharpness: float = setting(128.0, "final beta of the projection [-]", ge=1, le=1e4)
+    continuation: int = setting(
+        25, "number of iterations after which beta doubles [-]", ge=1, le=MAX_ITERATIONS
     )
-    continuation: int = Field(
-        default=25,
-        ge=1,
-        le=MAX_ITERATIONS,
-        description="number of iterations after which beta doubles [-]",
-    )
-    erosion: float = Field(
-        default=0.1,
+    erosion: float = setting(
+        0.1,
+        "distance of the thresholds of the eroded and dilated designs from 0.5; with "
+        "a member and a gap of two widths that of the thinner one's [-]",
         ge=1e-3,
         le=0.499,
-        description="distance of the thresholds of the eroded and dilated designs from 0.5; with "
-        "a member and a gap of two widths that of the thinner one's [-]",
     )
-    limits_on: Literal["nominal", "eroded"] = Field(
-        default="nominal",
-        description="which of the robust projection's designs keeps the limits: the nominal one, "
+    limits_on: Literal["nominal", "eroded"] = setting(
+        "nominal",
+        "which of the robust projection's designs keeps the limits: the nominal one, "
         'as it is meant, or "eroded", every one of them [-]',
     )
-    minimum_member: float = Field(
-        default=0.0,
-        ge=0,
-        le=1e4,
-        description="smallest width of members with the robust projection; sets the filter "
+    minimum_member: float = setting(
+        0.0,
+        "smallest width of members with the robust projection; sets the filter "
         "radius (filter_radius stays at its default); 0: no limit, or minimum_gap [m]",
-    )
-    minimum_gap: float = Field(
-        default=0.0,
         ge=0,
         le=1e4,
-        description="smallest width of gaps between members alike; 0: minimum_member [m]",
+    )
+    minimum_gap: float = setting(
+        0.0, "smallest width of gaps between members alike; 0: minimum_member [m]", ge=0, le=1e4
     )
 
     @property
@@ -314,18 +305,18 @@ BORDER = 1e-6
 class Region(Table):
     """A part of an arm that stays solid or void whatever the design."""
 
-    kind: RegionKind = Field(description="what the region stays: solid or void [-]")
-    box: tuple[Position, Position, Position, Position] | None = Field(
-        default=None,
-        description="[x0, y0, x1, y1] in the arm's frame, x along from the inboard joint axis, y "
+    kind: RegionKind = setting("what the region stays: solid or void [-]")
+    box: tuple[Position, Position, Position, Position] | None = setting(
+        None,
+        "[x0, y0, x1, y1] in the arm's frame, x along from the inboard joint axis, y "
         "across from the middle [m]",
     )
-    circle: tuple[Position, Position, Length] | None = Field(
-        default=None, description="[x, y, radius] of a disc in place of box [m]"
+    circle: tuple[Position, Position, Length] | None = setting(
+        None, "[x, y, radius] of a disc in place of box [m]"
     )
-    depth: tuple[Position, Position] | None = Field(
-        default=None,
-        description="[z0, z1] over which it extends in a solid arm, z along the thickness from the "
+    depth: tuple[Position, Position] | None = setting(
+        None,
+        "[z0, z1] over which it extends in a solid arm, z along the thickness from the "
         "middle; default: through the whole thickness [m]",
     )
 
@@ -429,18 +420,14 @@ Law = Literal["two-material", "simp", "pedersen", "du-olhoff", "ramp"]
 class Interpolation(Table):
     """How stiffness and mass follow from the design variable x of a cell."""
 
-    law: Law = Field(
-        default="two-material", description="interpolation law of stiffness and mass [-]"
-    )
-    penalty: float = Field(
-        default=3.0, ge=1, le=20, description='exponent p of x in the stiffness; q of "ramp" [-]'
-    )
-    floor: float = Field(
-        default=1e-6,
+    law: Law = setting("two-material", "interpolation law of stiffness and mass [-]")
+    penalty: float = setting(3.0, 'exponent p of x in the stiffness; q of "ramp" [-]', ge=1, le=20)
+    floor: float = setting(
+        1e-6,
+        "stiffness and density of void relative to solid; laws other than "
+        '"two-material" use its square [-]',
         ge=1e-12,
         lt=1,
-        description="stiffness and density of void relative to solid; laws other than "
-        '"two-material" use its square [-]',
     )
 
 
@@ -450,27 +437,21 @@ class Interpolation(Table):
 class Optimizer(Table):
     """When the optimiser stops and how far it moves at once."""
 
-    max_iterations: int = Field(
-        default=1000,
+    max_iterations: int = setting(
+        1000,
+        "largest number of design iterations; runs end by themselves before [-]",
         ge=0,
         le=MAX_ITERATIONS,
-        description="largest number of design iterations; runs end by themselves before [-]",
     )
-    move: float = Field(
-        default=0.2, ge=1e-6, le=1, description="largest step of x in one iteration [-]"
+    move: float = setting(0.2, "largest step of x in one iteration [-]", ge=1e-6, le=1)
+    tolerance: float = setting(
+        1e-3, "relative gain of the best design in 20 iterations that ends the run [-]", ge=0, le=1
     )
-    tolerance: float = Field(
-        default=1e-3,
-        ge=0,
-        le=1,
-        description="relative gain of the best design in 20 iterations that ends the run [-]",
-    )
-    kkt_tolerance: float = Field(
-        default=2e-2,
+    kkt_tolerance: float = setting(
+        2e-2,
+        "Karush-Kuhn-Tucker residual up to which the certificate calls a design stationary [-]",
         ge=0,
         le=1e6,
-        description="Karush-Kuhn-Tucker residual up to which the certificate calls a design "
-        "stationary [-]",
     )
 
 
@@ -483,36 +464,24 @@ MAX_STARTS = 100
 class Part(Table):
     """Parts for the workshop."""
 
-    tool_radius: float | None = Field(
-        default=None,
-        ge=0,
-        le=1e4,
-        description="least radius of concave corners; default: 0.003 [m]",
+    tool_radius: float | None = setting(
+        None, "least radius of concave corners; default: 0.003 [m]", ge=0, le=1e4
     )
-    tolerance: Length | None = Field(
-        default=None,
-        description="how far sides may lie from the outline of the densities; default: half a cell "
-        "[m]",
+    tolerance: Length | None = setting(
+        None, "how far sides may lie from the outline of the densities; default: half a cell [m]"
     )
-    minimum_member: Length | None = Field(
-        default=None,
-        description="smallest width of members of a part; default: design.minimum_member, or 0.001 "
-        "[m]",
+    minimum_member: Length | None = setting(
+        None, "smallest width of members of a part; default: design.minimum_member, or 0.001 [m]"
     )
-    optimize: bool = Field(
-        default=False,
-        description="optimise the parts' free curves, too: the scene's objective within its limits "
-        "[-]",
+    optimize: bool = setting(
+        False, "optimise the parts' free curves, too: the scene's objective within its limits [-]"
     )
-    iterations: int = Field(
-        default=80,
-        ge=1,
-        le=MAX_ITERATIONS,
-        description="largest number of steps of the curves from every start [-]",
+    iterations: int = setting(
+        80, "largest number of steps of the curves from every start [-]", ge=1, le=MAX_ITERATIONS
     )
-    starts: int = Field(
-        default=0,
+    starts: int = setting(
+        0,
+        "trusses that the curves start from besides the result of the densities [-]",
         ge=0,
         le=MAX_STARTS,
-        description="trusses that the curves start from besides the result of the densities [-]",
     )

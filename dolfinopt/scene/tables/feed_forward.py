@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field
-
-from dolfinopt.scene.tables.base import Duration, Loc, Refusal, Table, Use, shown
+from dolfinopt.scene.tables.base import Duration, Loc, Refusal, Table, Use, setting, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -19,26 +17,25 @@ class FeedForward(Table):
 
     USES = (Use("joints spacing lead", "kind", "tip"),)
 
-    kind: Literal["none", "tip"] = Field(
-        default="none",
-        description='"tip": joints move so that the tip of the bending arms follows the path [-]',
+    kind: Literal["none", "tip"] = setting(
+        "none", '"tip": joints move so that the tip of the bending arms follows the path [-]'
     )
-    joints: tuple[str, ...] | None = Field(
-        default=None,
-        description="names of the driven joints that are corrected; default: as many as the path "
+    joints: tuple[str, ...] | None = setting(
+        None,
+        "names of the driven joints that are corrected; default: as many as the path "
         "has components, those that move the tip best [-]",
     )
-    spacing: Duration | None = Field(
-        default=None,
-        description="largest distance between the knots of the corrections' splines; default: as "
+    spacing: Duration | None = setting(
+        None,
+        "largest distance between the knots of the corrections' splines; default: as "
         "small as it takes to leave a ten thousandth of the deviation [s]",
     )
-    lead: float | None = Field(
-        default=None,
+    lead: float | None = setting(
+        None,
+        "time before and after the motion in which joints may already, or still, be "
+        "corrected; the path begins after it; default: 5 % of motion.duration [s]",
         ge=0,
         le=1e5,
-        description="time before and after the motion in which joints may already, or still, be "
-        "corrected; the path begins after it; default: 5 % of motion.duration [s]",
     )
 
     @property

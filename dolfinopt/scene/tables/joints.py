@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from dolfinopt.scene.tables.base import Length, Position, Refusal, Table, shown
+from dolfinopt.scene.tables.base import Length, Position, Refusal, Table, setting, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -42,24 +42,24 @@ def _check_name(name: str) -> str:
 class Interface(Table):
     """A rigid part of an arm's surface: one more, or the bore that is one of the arm's ends."""
 
-    name: Annotated[str, AfterValidator(_check_name)] = Field(
-        description="unique name of the arm's interface, also that of its faces in a mesh file and "
+    name: Annotated[str, AfterValidator(_check_name)] = setting(
+        "unique name of the arm's interface, also that of its faces in a mesh file and "
         'of its node in a SID file; "inboard" and "outboard" are the bores at the ends of a solid '
         "arm with a mesh file: they place the arm's frame, wherever the file has the arm [-]"
     )
-    point: Point = Field(
-        description="its reference point in the arm's frame, of a bore the middle of its axis; "
+    point: Point = setting(
+        "its reference point in the arm's frame, of a bore the middle of its axis; "
         'with an interface "inboard" in the mesh file\'s frame [m]'
     )
-    radius: Length | None = Field(
-        default=None,
-        description="of an arm made of cells: the sides of cells on its surface whose middle lies "
+    radius: Length | None = setting(
+        None,
+        "of an arm made of cells: the sides of cells on its surface whose middle lies "
         "within this distance of the point, each as a whole, are the interface; with axis, of the "
         "bore [m]",
     )
-    axis: Axis | None = Field(
-        default=None,
-        description="of an arm with a mesh file: the interface is the bore of this radius about "
+    axis: Axis | None = setting(
+        None,
+        "of an arm with a mesh file: the interface is the bore of this radius about "
         "the line through the point along this direction, of any length, in the point's frame [-]",
     )
 
@@ -240,31 +240,31 @@ Inertia = Annotated[float, Field(ge=0, le=1e9)]  # kg m2
 Ratio = Annotated[float, Field(ge=1e-3, le=1e6)]
 RotorInertia = Annotated[
     Inertia,
-    Field(
-        description="moment of inertia of the rotor that drives the joint, about its own axis, "
-        "which is the joint's; not part of joint_inertia [kg m2]",
+    setting(
+        "moment of inertia of the rotor that drives the joint, about its own axis, "
+        "which is the joint's; not part of joint_inertia [kg m2]"
     ),
 ]
 GearRatio = Annotated[
     Ratio | None,
-    Field(
-        description="revolutions of the rotor per revolution of the joint, against what the joint "
-        "sits on; of a prismatic joint in space radians per metre; stated with rotor_inertia [-]",
+    setting(
+        "revolutions of the rotor per revolution of the joint, against what the joint "
+        "sits on; of a prismatic joint in space radians per metre; stated with rotor_inertia [-]"
     ),
 ]
 GearStiffness = Annotated[
     float,
-    Field(
-        ge=0,
-        le=1e15,
-        description="stiffness of the gear between motor and joint, about or along the "
+    setting(
+        "stiffness of the gear between motor and joint, about or along the "
         "joint's axis, as the joint feels it; 0: none, the joint follows the motor exactly "
         "[N m/rad, N/m]",
+        ge=0,
+        le=1e15,
     ),
 ]
 GearDamping = Annotated[
     float,
-    Field(ge=0, le=1e15, description="damper beside gear_stiffness [N m s/rad, N s/m]"),
+    setting("damper beside gear_stiffness [N m s/rad, N s/m]", ge=0, le=1e15),
 ]
 
 
@@ -280,31 +280,31 @@ _Six = tuple[_Stiffness, _Stiffness, _Stiffness, _Stiffness, _Stiffness, _Stiffn
 BearingStiffness = Annotated[
     _Six | None,
     BeforeValidator(_zero_for_inf),
-    Field(
-        description="springs of the joint's bearing along x, y, z and about x, y, z of the "
+    setting(
+        "springs of the joint's bearing along x, y, z and about x, y, z of the "
         "joint's frame, between what the joint sits on and the joint; 0 or inf: rigid in that "
         "direction. In the plane along x, y and about z alone [N/m, N m/rad]"
     ),
 ]
 BearingDamping = Annotated[
     _Six | None,
-    Field(description="dampers beside bearing_stiffness, in the same order [N s/m, N m s/rad]"),
+    setting("dampers beside bearing_stiffness, in the same order [N s/m, N m s/rad]"),
 ]
 Friction = Annotated[
     tuple[_Stiffness, _Stiffness] | None,
-    Field(
-        description="viscous coefficient f_v and Coulomb friction f_c at the motor, as the joint "
+    setting(
+        "viscous coefficient f_v and Coulomb friction f_c at the motor, as the joint "
         "feels them: f_v v + f_c tanh(v / friction_speed) against its speed v "
         "[N m s/rad, N m; N s/m, N]"
     ),
 ]
 FrictionSpeed = Annotated[
     float,
-    Field(
+    setting(
+        "speed at which Coulomb friction has 76 % of its value, which it tends to "
+        "like tanh [rad/s, m/s]",
         ge=1e-6,
         le=1e6,
-        description="speed at which Coulomb friction has 76 % of its value, which it tends to "
-        "like tanh [rad/s, m/s]",
     ),
 ]
 FRICTION_SPEED = 0.02  # rad/s, m/s; default

@@ -15,6 +15,7 @@ from dolfinopt.scene.tables.base import (
     Table,
     Use,
     refuse_count,
+    setting,
     shown,
 )
 from dolfinopt.scene.tables.joints import (
@@ -67,32 +68,29 @@ class Joint(Table):
 
     USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"),)
 
-    name: Annotated[str, AfterValidator(check_joint_name)] = Field(
-        description="unique name, the column of its coordinate in tables [-]"
+    name: Annotated[str, AfterValidator(check_joint_name)] = setting(
+        "unique name, the column of its coordinate in tables [-]"
     )
-    type: JointType = Field(description="what moves: an angle, a distance, or nothing [-]")
-    parent: str = Field(
-        description='what it sits on: "arm" for its outboard interface, "arm.interface" for one of '
+    type: JointType = setting("what moves: an angle, a distance, or nothing [-]")
+    parent: str = setting(
+        'what it sits on: "arm" for its outboard interface, "arm.interface" for one of '
         'arms.interfaces, or "ground" [-]'
     )
-    child: str = Field(description="name of the arm that it holds, whose frame is the joint's [-]")
-    axis: Direction | None = Field(
-        default=None,
-        description="axis in the joint's frame, of any length; of revolute and prismatic ones [-]",
+    child: str = setting("name of the arm that it holds, whose frame is the joint's [-]")
+    axis: Direction | None = setting(
+        None, "axis in the joint's frame, of any length; of revolute and prismatic ones [-]"
     )
-    origin: tuple[Position, Position, Position] = Field(
-        default=(0.0, 0.0, 0.0),
-        description="origin of the joint's frame in the parent's interface frame, or in the "
-        "world's [m]",
+    origin: tuple[Position, Position, Position] = setting(
+        (0.0, 0.0, 0.0),
+        "origin of the joint's frame in the parent's interface frame, or in the world's [m]",
     )
-    rpy: tuple[Angle, Angle, Angle] = Field(
-        default=(0.0, 0.0, 0.0),
-        description="roll, pitch and yaw about the fixed axes x, y and z that place the joint's "
+    rpy: tuple[Angle, Angle, Angle] = setting(
+        (0.0, 0.0, 0.0),
+        "roll, pitch and yaw about the fixed axes x, y and z that place the joint's "
         "frame, as in URDF [rad]",
     )
-    passive: bool = Field(
-        default=False,
-        description="whether it has no drive and follows from the others by [[closures]] [-]",
+    passive: bool = setting(
+        False, "whether it has no drive and follows from the others by [[closures]] [-]"
     )
 
     rotor_inertia: RotorInertia = 0.0
@@ -104,19 +102,19 @@ class Joint(Table):
     friction: Friction = None
     friction_speed: FrictionSpeed = FRICTION_SPEED
 
-    position_limits: tuple[Coordinate, Coordinate] | None = Field(
-        default=None,
-        description="least and largest coordinate, as in URDF; a warning tells where the motion "
+    position_limits: tuple[Coordinate, Coordinate] | None = setting(
+        None,
+        "least and largest coordinate, as in URDF; a warning tells where the motion "
         "exceeds them [rad, m]",
     )
-    velocity_limit: Limit | None = Field(
-        default=None,
-        description="largest rate of the coordinate either way, as in URDF; a warning tells where "
+    velocity_limit: Limit | None = setting(
+        None,
+        "largest rate of the coordinate either way, as in URDF; a warning tells where "
         "the motion exceeds it [rad/s, m/s]",
     )
-    effort_limit: Limit | None = Field(
-        default=None,
-        description="largest torque or force of the drive either way, as in URDF; a warning tells "
+    effort_limit: Limit | None = setting(
+        None,
+        "largest torque or force of the drive either way, as in URDF; a warning tells "
         "where the motion asks for more. The optimiser keeps control.limits and "
         "constraints.peak_force [N m, N]",
     )
@@ -275,29 +273,29 @@ DriveForce = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
 class Control(Table):
     """Feed-forward and feedback that drive the rigid coordinates instead of prescribing them."""
 
-    feed_forward: FeedForward = Field(
-        default="rigid",
-        description="forces known in advance: inverse dynamics of the machine with rigid arms of "
+    feed_forward: FeedForward = setting(
+        "rigid",
+        "forces known in advance: inverse dynamics of the machine with rigid arms of "
         'the current design, its rotors and friction included; "elastic" also asks motors behind '
         "gear_stiffness to turn ahead of their joints by what the gears give; "
         '"tip": those of [feed_forward], with its joints as desired ones; or none [-]',
     )
-    stiffness: tuple[Gain, ...] = Field(
-        description="proportional gain of every driven coordinate, the cart first, then the joints "
+    stiffness: tuple[Gain, ...] = setting(
+        "proportional gain of every driven coordinate, the cart first, then the joints "
         "from the base outwards [N/m, N m/rad]"
     )
-    damping: tuple[Gain, ...] = Field(
-        description="derivative gain of every driven coordinate [N s/m, N m s/rad]"
+    damping: tuple[Gain, ...] = setting(
+        "derivative gain of every driven coordinate [N s/m, N m s/rad]"
     )
-    limits: tuple[DriveForce, ...] | None = Field(
-        default=None,
-        description="largest force of every drive: up to 95 % of its limit a drive gives what the "
+    limits: tuple[DriveForce, ...] | None = setting(
+        None,
+        "largest force of every drive: up to 95 % of its limit a drive gives what the "
         "control asks for, from 105 % on the limit, with a smooth transition between them "
         "(three times continuously differentiable); default: none [N, N m]",
     )
-    forces: FileName | None = Field(
-        default=None,
-        description="table (CSV) of forces that are added, with columns t, cart and the arms' "
+    forces: FileName | None = setting(
+        None,
+        "table (CSV) of forces that are added, with columns t, cart and the arms' "
         "names; zero behind its last row [N, N m]",
     )
 
@@ -322,8 +320,8 @@ class Control(Table):
 class Damping(Table):
     """Structural damping D = stiffness_proportional * K."""
 
-    stiffness_proportional: float = Field(
-        default=2e-4, ge=0, le=1e3, description="factor d of the damping matrix D = d K [s]"
+    stiffness_proportional: float = setting(
+        2e-4, "factor d of the damping matrix D = d K [s]", ge=0, le=1e3
     )
 
 
@@ -333,19 +331,18 @@ class Damping(Table):
 class Payload(Table):
     """What the end-effector carries."""
 
-    mass: float = Field(ge=0, le=1e9, description="point mass at the end-effector [kg]")
-    inertia: Moment | Tensor = Field(
-        default=0.0,
-        description="moment of inertia about its centre; in space about every axis, or the tensor "
+    mass: float = setting("point mass at the end-effector [kg]", ge=0, le=1e9)
+    inertia: Moment | Tensor = setting(
+        0.0,
+        "moment of inertia about its centre; in space about every axis, or the tensor "
         "xx, yy, zz, xy, xz, yz [kg m2]",
     )
-    offset: tuple[Position, Position, Position] = Field(
-        default=(0.0, 0.0, 0.0),
-        description="its centre in the frame of the end-effector's interface; in space [m]",
+    offset: tuple[Position, Position, Position] = setting(
+        (0.0, 0.0, 0.0), "its centre in the frame of the end-effector's interface; in space [m]"
     )
-    arm: str | None = Field(
-        default=None,
-        description='"arm" or "arm.interface" that carries it and is the end-effector, whose '
+    arm: str | None = setting(
+        None,
+        '"arm" or "arm.interface" that carries it and is the end-effector, whose '
         "deviation and path count; default: the last one; in space [-]",
     )
 
@@ -390,40 +387,32 @@ FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 class Force(Table):
     """A force and a moment on an interface of an arm, constant or from a table over time."""
 
-    name: Annotated[str, AfterValidator(check_joint_name)] | None = Field(
-        default=None, description="unique name, by which changes may call it [-]"
+    name: Annotated[str, AfterValidator(check_joint_name)] | None = setting(
+        None, "unique name, by which changes may call it [-]"
     )
-    arm: str = Field(
-        description='what it acts on: "arm" for its outboard interface, or "arm.interface" [-]'
+    arm: str = setting('what it acts on: "arm" for its outboard interface, or "arm.interface" [-]')
+    force: Vector | None = setting(
+        None, "constant force on the interface's point: x, y, in space x, y, z [N]"
     )
-    force: Vector | None = Field(
-        default=None,
-        description="constant force on the interface's point: x, y, in space x, y, z [N]",
+    moment: GivenMoment | None = setting(
+        None, "constant moment: in the plane a number, in space about x, y, z [N m]"
     )
-    moment: GivenMoment | None = Field(
-        default=None,
-        description="constant moment: in the plane a number, in space about x, y, z [N m]",
-    )
-    table: FileName | None = Field(
-        default=None,
-        description="table (CSV) over time, added to force and moment, with columns t, fx, fy, mz, "
+    table: FileName | None = setting(
+        None,
+        "table (CSV) over time, added to force and moment, with columns t, fx, fy, mz, "
         "in space t, fx, fy, fz, mx, my, mz; straight between its rows, zero behind the last "
         "[s, N, N m]",
     )
-    factor: float = Field(
-        default=1.0,
-        ge=-1e12,
-        le=1e12,
-        description="factor on force, moment and table, to be varied in studies [-]",
+    factor: float = setting(
+        1.0, "factor on force, moment and table, to be varied in studies [-]", ge=-1e12, le=1e12
     )
-    frame: ForceFrame = Field(
-        default="world",
-        description="whose directions x, y, z are: the world's, or the arm's, whose x leads from "
+    frame: ForceFrame = setting(
+        "world",
+        "whose directions x, y, z are: the world's, or the arm's, whose x leads from "
         "the inboard joint to the undeformed outboard one [-]",
     )
-    feed_forward: bool = Field(
-        default=True,
-        description="the feed-forward of [control] knows it; false: a disturbance [-]",
+    feed_forward: bool = setting(
+        True, "the feed-forward of [control] knows it; false: a disturbance [-]"
     )
 
     @model_validator(mode="after")

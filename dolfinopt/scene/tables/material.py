@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
-from dolfinopt.scene.tables.base import Refusal, Table, shown
+from dolfinopt.scene.tables.base import Refusal, Table, setting, shown
 
 YoungModulus = Annotated[float, Field(ge=1.0, le=1e15)]  # Pa
 PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
@@ -90,43 +90,42 @@ class Material(Table):
     `name = "NAME"` in it, for those that are not stated.
     """
 
-    name: CatalogueName | None = Field(
-        default=None,
-        description='name in the catalogue, e.g. "aluminium 7075-T6", from which values not stated '
+    name: CatalogueName | None = setting(
+        None,
+        'name in the catalogue, e.g. "aluminium 7075-T6", from which values not stated '
         'are taken; material = "NAME" in place of the table is short for it [-]',
     )
-    kind: Literal["isotropic", "orthotropic"] = Field(
-        default="isotropic",
-        description='material law; "orthotropic" has directions 1, 2, 3: the arm\'s x, y, z turned '
+    kind: Literal["isotropic", "orthotropic"] = setting(
+        "isotropic",
+        'material law; "orthotropic" has directions 1, 2, 3: the arm\'s x, y, z turned '
         "by angle [-]",
     )
-    young_modulus: YoungModuli = Field(
-        description="Young's modulus of the solid material; orthotropic [E1, E2] or [E1, E2, E3], "
+    young_modulus: YoungModuli = setting(
+        "Young's modulus of the solid material; orthotropic [E1, E2] or [E1, E2, E3], "
         "E3 = E2 by default [Pa]"
     )
-    poisson_ratio: PoissonRatios = Field(
-        description="Poisson's ratio; orthotropic nu12, contraction along 2 by tension along 1, in "
+    poisson_ratio: PoissonRatios = setting(
+        "Poisson's ratio; orthotropic nu12, contraction along 2 by tension along 1, in "
         "space of all three pairs, or [nu12, nu23, nu13] [-]"
     )
-    shear_modulus: ShearModuli | None = Field(
-        default=None,
-        description="shear modulus of an orthotropic material: G12, in space of all three planes, "
+    shear_modulus: ShearModuli | None = setting(
+        None,
+        "shear modulus of an orthotropic material: G12, in space of all three planes, "
         "or [G12, G23, G13] [Pa]",
     )
-    angle: FibreAngle | None = Field(
-        default=None,
-        description="angle of direction 1 from the arm's axis, from x towards y, in the wall of a "
+    angle: FibreAngle | None = setting(
+        None,
+        "angle of direction 1 from the arm's axis, from x towards y, in the wall of a "
         "hollow arm as seen from outside; default: 0 [rad]",
     )
-    angle_axis: Axis | None = Field(
-        default=None,
-        description="axis about which angle turns, in the frame of a solid arm; default: "
+    angle_axis: Axis | None = setting(
+        None,
+        "axis about which angle turns, in the frame of a solid arm; default: "
         "[0, 0, 1], of a hollow arm its wall's normal [-]",
     )
-    density: MassDensity = Field(description="mass density of the solid material [kg/m3]")
-    yield_strength: YieldStrength | None = Field(
-        default=None,
-        description="stress up to which the solid material is elastic; for reports alone [Pa]",
+    density: MassDensity = setting("mass density of the solid material [kg/m3]")
+    yield_strength: YieldStrength | None = setting(
+        None, "stress up to which the solid material is elastic; for reports alone [Pa]"
     )
 
     @property

@@ -17,6 +17,7 @@ from dolfinopt.scene.tables.base import (
     Refusal,
     Table,
     Use,
+    setting,
 )
 
 if TYPE_CHECKING:
@@ -59,125 +60,109 @@ class Motion(Table):
         Use("max_jerk", "law", "quintic septic s-curve"),
     )
 
-    path: PathKind = Field(
-        description="path of the end-effector (arc, line, table of points), a table of joint "
-        "coordinates, or a first joint that runs up to constant speed [-]",
+    path: PathKind = setting(
+        "path of the end-effector (arc, line, table of points), a table of joint "
+        "coordinates, or a first joint that runs up to constant speed [-]"
     )
-    radius: Length = Field(
-        default=1.0,
-        description="radius of the arc, a semicircle about the origin; default: half the length of "
+    radius: Length = setting(
+        1.0,
+        "radius of the arc, a semicircle about the origin; default: half the length of "
         "all arms [m]",
     )
-    flattening: float = Field(
-        default=1.0,
-        ge=0,
-        le=1,
-        description="factor on the y coordinate of the arc; 0 gives a straight line [-]",
+    flattening: float = setting(
+        1.0, "factor on the y coordinate of the arc; 0 gives a straight line [-]", ge=0, le=1
     )
-    start: Point = Field(
-        default=(-1.0, 0.0), description="start point of the line; in space three numbers [m]"
-    )
-    end: Point = Field(
-        default=(1.0, 0.0), description="end point of the line; in space three numbers [m]"
-    )
-    rpy: tuple[Angle, Angle, Angle] | None = Field(
-        default=None,
-        description="orientation of the end-effector along a line in space: roll, pitch and yaw "
+    start: Point = setting((-1.0, 0.0), "start point of the line; in space three numbers [m]")
+    end: Point = setting((1.0, 0.0), "end point of the line; in space three numbers [m]")
+    rpy: tuple[Angle, Angle, Angle] | None = setting(
+        None,
+        "orientation of the end-effector along a line in space: roll, pitch and yaw "
         "about the world's axes x, y and z; default: free [rad]",
     )
-    initial_joints: tuple[JointValue, ...] | None = Field(
-        default=None,
-        description="joint coordinates near those at the start of an end-effector's path in "
+    initial_joints: tuple[JointValue, ...] | None = setting(
+        None,
+        "joint coordinates near those at the start of an end-effector's path in "
         "space, or of closed loops, for [[joints]] that move, in the plane for all arms: which "
         "solution is meant; default: 0, in the plane by closures.side [rad, m]",
     )
-    file: FileName | None = Field(
-        default=None,
-        description="table (CSV) of points or joint coordinates; relative to the scene's folder "
+    file: FileName | None = setting(
+        None,
+        "table (CSV) of points or joint coordinates; relative to the scene's folder "
         "or the working directory [-]",
     )
-    speed: float = Field(
-        default=10.0,
+    speed: float = setting(
+        10.0,
+        "angular velocity of the first joint after motion.duration, which the law "
+        "gives it; path rotation [rad/s]",
         ge=-1e6,
         le=1e6,
-        description="angular velocity of the first joint after motion.duration, which the law "
-        "gives it; path rotation [rad/s]",
     )
-    start_angle: float = Field(
-        default=0.0, ge=-1e3, le=1e3, description="angle of the first joint at the start [rad]"
+    start_angle: float = setting(
+        0.0, "angle of the first joint at the start [rad]", ge=-1e3, le=1e3
     )
-    law: TimeLaw = Field(
-        default="quintic",
-        description="time law along the path; for a table with times, of every move between two "
-        "stops [-]",
+    law: TimeLaw = setting(
+        "quintic",
+        "time law along the path; for a table with times, of every move between two stops [-]",
     )
-    shape: ShapeCount | tuple[Coefficient, ...] = Field(
-        default=0,
-        description="how many coefficients of the law optimize chooses beside the densities, at "
+    shape: ShapeCount | tuple[Coefficient, ...] = setting(
+        0,
+        "how many coefficients of the law optimize chooses beside the densities, at "
         "most 8, or their values, shares of the way [-]",
     )
-    acceleration_share: float = Field(
-        default=0.25,
-        ge=1e-3,
-        le=0.5,
-        description='fraction of the duration in which "trapezoidal" and "s-curve" accelerate, '
+    acceleration_share: float = setting(
+        0.25,
+        'fraction of the duration in which "trapezoidal" and "s-curve" accelerate, '
         "and the same in which they brake; unused if the last of their limits "
         "(max_acceleration, max_jerk) is given [-]",
+        ge=1e-3,
+        le=0.5,
     )
-    max_speed: PathLimit | None = Field(
-        default=None, description="limit of the speed along the path [m/s]"
+    max_speed: PathLimit | None = setting(None, "limit of the speed along the path [m/s]")
+    max_acceleration: PathLimit | None = setting(
+        None, "limit of the acceleration along the path [m/s2]"
     )
-    max_acceleration: PathLimit | None = Field(
-        default=None, description="limit of the acceleration along the path [m/s2]"
+    max_jerk: PathLimit | None = setting(
+        None, 'limit of the jerk along the path; not with "trapezoidal" [m/s3]'
     )
-    max_jerk: PathLimit | None = Field(
-        default=None, description='limit of the jerk along the path; not with "trapezoidal" [m/s3]'
-    )
-    duration: Duration = Field(
-        default=1.9,
-        description="time from start to end of the path; where a table has times or limits are "
+    duration: Duration = setting(
+        1.9,
+        "time from start to end of the path; where a table has times or limits are "
         "given, the default is the last time or the shortest possible [s]",
     )
-    horizon: Duration = Field(
-        default=3.0,
-        description="simulated time, at least the duration, after which the machine stays at "
+    horizon: Duration = setting(
+        3.0,
+        "simulated time, at least the duration, after which the machine stays at "
         "rest or keeps its speed; the default is the duration if that is longer [s]",
     )
-    table_ends: Literal["rest", "moving"] = Field(
-        default="rest",
-        description="whether a table with times rests at its first and last instant, or moves "
+    table_ends: Literal["rest", "moving"] = setting(
+        "rest",
+        "whether a table with times rests at its first and last instant, or moves "
         "there at the rates of its own rows, as one cut out of a motion does [-]",
     )
-    dwells: bool | tuple[tuple[Instant, Instant], ...] = Field(
-        default=True,
-        description="further rest intervals for settling: true, every stop of the path; false, "
+    dwells: bool | tuple[tuple[Instant, Instant], ...] = setting(
+        True,
+        "further rest intervals for settling: true, every stop of the path; false, "
         "none; or a list of [start, end] [s]",
     )
-    base: Base = Field(default="cart", description="what carries the shoulder joint [-]")
-    base_position: Position = Field(
-        default=0.0, description="x of the shoulder joint on a fixed base [m]"
-    )
-    cart_follow: float = Field(
-        default=0.5,
+    base: Base = setting("cart", "what carries the shoulder joint [-]")
+    base_position: Position = setting(0.0, "x of the shoulder joint on a fixed base [m]")
+    cart_follow: float = setting(
+        0.5,
+        "cart's position over the end-effector's desired x; not with one arm, a "
+        "fixed base or a table of joint coordinates [-]",
         ge=-1e3,
         le=1e3,
-        description="cart's position over the end-effector's desired x; not with one arm, a "
-        "fixed base or a table of joint coordinates [-]",
     )
-    cart_mass: float = Field(default=0.0, ge=0, le=1e9, description="mass of the cart [kg]")
-    joint_height: Position = Field(
-        default=-0.5,
-        description="y of the shoulder joint; default: a quarter of the length of all arms below 0 "
-        "[m]",
+    cart_mass: float = setting(0.0, "mass of the cart [kg]", ge=0, le=1e9)
+    joint_height: Position = setting(
+        -0.5, "y of the shoulder joint; default: a quarter of the length of all arms below 0 [m]"
     )
-    elbow: Literal[-1, 1] = Field(
-        default=-1,
-        description="sign of the elbow angle beta; with one arm, of the cosine of its angle [-]",
+    elbow: Literal[-1, 1] = setting(
+        -1, "sign of the elbow angle beta; with one arm, of the cosine of its angle [-]"
     )
-    gravity: Gravity = Field(
-        default=(0.0, 0.0),
-        description="gravitational acceleration in x and y; in space, with [[joints]], in x, y and "
-        "z [m/s2]",
+    gravity: Gravity = setting(
+        (0.0, 0.0),
+        "gravitational acceleration in x and y; in space, with [[joints]], in x, y and z [m/s2]",
     )
 
     @model_validator(mode="after")
@@ -371,24 +356,21 @@ MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a 
 class Simulation(Table):
     """Time integration of the elastic coordinates and its output."""
 
-    tolerance: float = Field(
-        default=1e-4,
-        ge=1e-12,
-        le=0.1,
-        description="relative error allowed in the elastic coordinates [-]",
+    tolerance: float = setting(
+        1e-4, "relative error allowed in the elastic coordinates [-]", ge=1e-12, le=0.1
     )
-    stages: int = Field(default=4, ge=2, le=5, description="stages of the Radau IIA method [-]")
-    stiffening: bool | Literal["auto"] = Field(
-        default="auto",
-        description="geometric stiffening by the arms' own stress: true, false, or where the "
+    stages: int = setting(4, "stages of the Radau IIA method [-]", ge=2, le=5)
+    stiffening: bool | Literal["auto"] = setting(
+        "auto",
+        "geometric stiffening by the arms' own stress: true, false, or where the "
         "loads change an arm's stiffness by 0.25 % [-]",
     )
-    sample: float = Field(
-        default=1e-3,
+    sample: float = setting(
+        1e-3,
+        "interval of the instants in trajectory.npz and trajectory.csv; no result "
+        "depends on it [s]",
         ge=1e-9,
         le=1e5,
-        description="interval of the instants in trajectory.npz and trajectory.csv; no result "
-        "depends on it [s]",
     )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
@@ -421,23 +403,21 @@ class Reduction(Table):
         Use("tolerance", "coordinates", "auto"),
     )
 
-    method: ReductionMethod = Field(
-        default="craig-bampton", description="method of model reduction [-]"
-    )
-    coordinates: Coordinates = Field(
-        default=4,
-        description='number of elastic coordinates q of each arm; "auto": the smallest number '
+    method: ReductionMethod = setting("craig-bampton", "method of model reduction [-]")
+    coordinates: Coordinates = setting(
+        4,
+        'number of elastic coordinates q of each arm; "auto": the smallest number '
         "that meets reduction.tolerance; default in space: 6 for each outboard interface [-]",
     )
-    tolerance: float = Field(
-        default=1e-3,
+    tolerance: float = setting(
+        1e-3,
+        'with "auto": allowed relative error of the reduction, energy norm [-]',
         ge=1e-6,
         le=0.5,
-        description='with "auto": allowed relative error of the reduction, energy norm [-]',
     )
-    frequencies: tuple[Frequency, ...] | None = Field(
-        default=None,
-        description='frequencies at which "krylov" matches moments, by default 0; least and '
+    frequencies: tuple[Frequency, ...] | None = setting(
+        None,
+        'frequencies at which "krylov" matches moments, by default 0; least and '
         'largest one whose responses "balanced" weights, by default 0 and 50 [Hz]',
     )
 

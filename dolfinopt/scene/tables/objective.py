@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
-from dolfinopt.scene.tables.base import Loc, Refusal, Table, refuse_count, shown
+from dolfinopt.scene.tables.base import Loc, Refusal, Table, refuse_count, setting, shown
 from dolfinopt.scene.tables.responses import (
     DECLARED,
     LARGEST_LOAD,
@@ -53,91 +53,82 @@ Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 class Objective(Table):
     """What is minimised."""
 
-    kind: ObjectiveKind = Field(
-        default="esl",
-        description='minimised response, "esl" being the compliance of the load cases; or '
+    kind: ObjectiveKind = setting(
+        "esl",
+        'minimised response, "esl" being the compliance of the load cases; or '
         "frequency, maximised [-]",
     )
-    direction: Direction | None = Field(
-        default=None,
-        description="minimize or maximize the response; default: maximize frequencies, minimize "
+    direction: Direction | None = setting(
+        None,
+        "minimize or maximize the response; default: maximize frequencies, minimize "
         "everything else [-]",
     )
-    load_cases: int = Field(
-        default=30,
-        ge=1,
-        description="number of load cases: the worst instant of each of so many equal intervals "
+    load_cases: int = setting(
+        30,
+        "number of load cases: the worst instant of each of so many equal intervals "
         "of the horizon [-]",
+        ge=1,
     )
-    worst: WorstBy = Field(
-        default="compliance",
-        description="quantity that decides which instant of an interval is the worst [-]",
+    worst: WorstBy = setting(
+        "compliance", "quantity that decides which instant of an interval is the worst [-]"
     )
-    gradient: GradientKind = Field(
-        default="exact",
-        description='"exact": of the whole simulation, as it always is of drive forces; "esl": '
+    gradient: GradientKind = setting(
+        "exact",
+        '"exact": of the whole simulation, as it always is of drive forces; "esl": '
         'equivalent static loads held constant, the default with kind = "esl" if no limit under '
         "[constraints] follows the motion [-]",
     )
-    exponent: float = Field(
-        default=20.0,
+    exponent: float = setting(
+        20.0,
+        "exponent p of the p-means that stand for extremes: over time, modes, load "
+        "cases, scenarios, robust designs [-]",
         ge=2,
         le=200,
-        description="exponent p of the p-means that stand for extremes: over time, modes, load "
-        "cases, scenarios, robust designs [-]",
     )
-    stress_exponent: float = Field(
-        default=4.0,
+    stress_exponent: float = setting(
+        4.0,
+        "exponent p of the p-mean of the stress over cells and instants; with larger "
+        "ones cells come and go as the largest, and steps must be small [-]",
         ge=2,
         le=100,
-        description="exponent p of the p-mean of the stress over cells and instants; with larger "
-        "ones cells come and go as the largest, and steps must be small [-]",
     )
-    stress_margin: float = Field(
-        default=0.0,
+    stress_margin: float = setting(
+        0.0,
+        "cells closer than this to an interface do not count for the stress: at the "
+        "corners of a clamped edge it grows without bound as cells shrink [m]",
         ge=0,
         le=1e4,
-        description="cells closer than this to an interface do not count for the stress: at the "
-        "corners of a clamped edge it grows without bound as cells shrink [m]",
     )
-    scenarios: Combination = Field(
-        default="sum",
-        description="how scenarios are combined in the objective: weighted sum, or smooth maximum "
-        "[-]",
+    scenarios: Combination = setting(
+        "sum", "how scenarios are combined in the objective: weighted sum, or smooth maximum [-]"
     )
-    loads: tuple[Load | SpatialLoad, ...] = Field(
-        default=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        description="static load cases [F_x N, F_y N, moment N m] at each arm's outboard "
+    loads: tuple[Load | SpatialLoad, ...] = setting(
+        ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        "static load cases [F_x N, F_y N, moment N m] at each arm's outboard "
         "interface; of solids force and moment of three components each, by default unit forces "
         "along y and z and a unit moment about x [-]",
     )
-    effort_weights: tuple[Weight, ...] | None = Field(
-        default=None,
-        description="what the force of every drive is multiplied by in effort and peak_force, the "
+    effort_weights: tuple[Weight, ...] | None = setting(
+        None,
+        "what the force of every drive is multiplied by in effort and peak_force, the "
         "cart's first, then the joints' from the base outwards: the reciprocals of the drives' "
         "rated forces; default: 1 each [1/N, 1/(N m)]",
     )
-    attached: Attached = Field(
-        default="rigid-body",
-        description="model of what an arm carries, for its eigenfrequencies [-]",
+    attached: Attached = setting(
+        "rigid-body", "model of what an arm carries, for its eigenfrequencies [-]"
     )
-    elbow_angle: float | None = Field(
-        default=None,
+    elbow_angle: float | None = setting(
+        None,
+        "angle of every joint outboard of an arm, for its eigenfrequencies; "
+        "default: that at the middle of the path [rad]",
         ge=-100,
         le=100,
-        description="angle of every joint outboard of an arm, for its eigenfrequencies; "
-        "default: that at the middle of the path [rad]",
     )
-    modes: int = Field(
-        default=3,
-        ge=1,
-        le=50,
-        description="number of lowest modes in the p-mean of the eigenfrequency [-]",
+    modes: int = setting(
+        3, "number of lowest modes in the p-mean of the eigenfrequency [-]", ge=1, le=50
     )
-    follow: bool = Field(
-        default=False,
-        description="track the initial design's first mode by its MAC value in place of the "
-        "p-mean [-]",
+    follow: bool = setting(
+        False, "track the initial design's first mode by its MAC value in place of the p-mean [-]"
     )
 
     @field_validator("loads")
@@ -302,19 +293,15 @@ Limit = float | tuple[float | None, ...] | tuple[StiffnessCase, ...]
 class ConstraintOptions(Table):
     """Options of limits."""
 
-    settling_after: Delay = Field(
-        default=0.0,
-        description="time from the beginning of each rest after which settling counts [s]",
+    settling_after: Delay = setting(
+        0.0, "time from the beginning of each rest after which settling counts [s]"
     )
-    damping_below: Frequency | None = Field(
-        default=None,
-        description="frequency below which poles count for constraints.damping_ratio; default: "
-        "all do [Hz]",
+    damping_below: Frequency | None = setting(
+        None,
+        "frequency below which poles count for constraints.damping_ratio; default: all do [Hz]",
     )
-    poles_at: tuple[Delay, ...] | None = Field(
-        default=None,
-        description="instants at which poles count; default: start, middle and end of the motion "
-        "[s]",
+    poles_at: tuple[Delay, ...] | None = setting(
+        None, "instants at which poles count; default: start, middle and end of the motion [s]"
     )
 
     @property
@@ -466,13 +453,11 @@ TABLES = ("motion", "control", "closures", "payload", "forces", "damping", "mate
 class Scenario(Table):
     """A scenario: another use of the same design, part of the objective."""
 
-    changes: tuple[str, ...] = Field(
-        description='changes to the scene as "key=value", of motion, control, closures, payload, '
+    changes: tuple[str, ...] = setting(
+        'changes to the scene as "key=value", of motion, control, closures, payload, '
         "forces, damping or material [-]"
     )
-    weight: float = Field(
-        default=1.0, ge=1e-9, le=1e9, description="weight in the sum of the scenarios [-]"
-    )
+    weight: float = setting(1.0, "weight in the sum of the scenarios [-]", ge=1e-9, le=1e9)
 
     @field_validator("changes")
     @classmethod

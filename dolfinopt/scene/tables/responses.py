@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
-from dolfinopt.scene.tables.base import Loc, Refusal, Table
+from dolfinopt.scene.tables.base import Loc, Refusal, Table, setting
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -47,22 +47,19 @@ Component = Annotated[float, Field(ge=-LARGEST_LOAD, le=LARGEST_LOAD)]  # N, N m
 class StiffnessCase(Table):
     """A static load on one arm, and how far it may move the arm's outboard interface."""
 
-    arm: str = Field(description="name of the arm, which is clamped at its inboard interface [-]")
-    force: tuple[Component, Component] | tuple[Component, Component, Component] | None = Field(
-        default=None,
-        description="force at the outboard interface in the arm's frame: two components, three of "
-        "a solid [N]",
+    arm: str = setting("name of the arm, which is clamped at its inboard interface [-]")
+    force: tuple[Component, Component] | tuple[Component, Component, Component] | None = setting(
+        None,
+        "force at the outboard interface in the arm's frame: two components, three of a solid [N]",
     )
-    moment: Component | tuple[Component, Component, Component] | None = Field(
-        default=None,
-        description="moment there: one number, of a solid three components [N m]",
+    moment: Component | tuple[Component, Component, Component] | None = setting(
+        None, "moment there: one number, of a solid three components [N m]"
     )
-    displacement: Distance | None = Field(
-        default=None, description="upper limit of the length of the interface's displacement [m]"
+    displacement: Distance | None = setting(
+        None, "upper limit of the length of the interface's displacement [m]"
     )
-    rotation: Angle | None = Field(
-        default=None,
-        description="upper limit of its rotation, of a solid its vector's length [rad]",
+    rotation: Angle | None = setting(
+        None, "upper limit of its rotation, of a solid its vector's length [rad]"
     )
 
     @property
