@@ -149,6 +149,9 @@ def command_reference() -> str:
         if rows := [row for one in options if (row := one.get_help_record(context))]:
             lines += ["| option | meaning |", "|---|---|"]
             lines += [f"| <code>{_cell(a)}</code> | {_cell(b)} |" for a, b in rows]
+        for one in options:
+            if one.hidden and one.help:
+                lines.append(f"| older: <code>{one.opts[0]}</code> | {_cell(one.help)} |")
     return "\n".join(lines) + "\n"
 
 

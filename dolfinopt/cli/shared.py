@@ -281,7 +281,7 @@ def old_option(*names: str, now: str, **settings: Any) -> Callable[..., Any]:
             warn([f"{names[0]} is an older option: {now}"])
         return value
 
-    return click.option(*names, hidden=True, callback=tell_now, **settings)
+    return click.option(*names, hidden=True, help=now, callback=tell_now, **settings)
 
 
 def out_option(what: str) -> Callable[..., Any]:
