@@ -316,7 +316,7 @@ def drawn_by_hand(name: str, kind: str) -> Rows:
             result, _ = evaluate(scene, partition, arms, x, Profile(), simulated=False)
         except ConvergenceError:
             return True, np.inf, np.inf, size
-        excess = max((one.excess for one in limits_of(scene, result)), default=0.0)
+        excess = max((limit.excess for limit in limits_of(scene, result)), default=0.0)
         return excess > EXCESS, sign * result.objective, excess, size
 
     def best() -> tuple[bool, float, float, float]:

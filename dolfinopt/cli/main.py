@@ -157,9 +157,10 @@ def _materials(pattern: str | None, found: list[KeyInfo]) -> list[str]:
     asked = any(info.key == "material.name" for info in found)
     word = pattern.casefold()
     rows = [
-        f"{name:<24}{_in_units(one.young_modulus, 1e9):>9} GPa{one.poisson_ratio:>7.3g}"
-        f"{one.density:>7.0f} kg/m3{_in_units(one.yield_strength, 1e6):>6} MPa  {one.source}"
-        for name, one in CATALOGUE.items()
+        f"{name:<24}{_in_units(material.young_modulus, 1e9):>9} GPa{material.poisson_ratio:>7.3g}"
+        f"{material.density:>7.0f} kg/m3{_in_units(material.yield_strength, 1e6):>6} MPa  "
+        f"{material.source}"
+        for name, material in CATALOGUE.items()
         if asked or word in name.casefold()
     ]
     head = f"{'material':<24}{'Young':>13}{'Poisson':>8}{'density':>12}{'yield':>10}  source"

@@ -127,7 +127,9 @@ def _against_bars(result: Result, value: float) -> str:
     assert result.bars is not None
     bars = "straight solid bars of the same mass"
     exceeded = [
-        one for one in limits_of(result.scene, result.bars) if one.excess > 0.01 and not one.of_mass
+        limit
+        for limit in limits_of(result.scene, result.bars)
+        if limit.excess > 0.01 and not limit.of_mass
     ]
     missed = ", ".join(one.usage for one in exceeded)
     if result.scene.objective.kind == "mass":

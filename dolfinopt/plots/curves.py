@@ -432,7 +432,10 @@ def law_figure(scene: Scene) -> Figure:
 
 def constraint_label(name: str) -> str:
     """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
-    for quantity in (VOLUME.name, *(one.key for one in DECLARED.values() if one.key)):
+    for quantity in (
+        VOLUME.name,
+        *(response.key for response in DECLARED.values() if response.key),
+    ):
         if name == quantity or name.startswith(f"{quantity}_"):
             arm = name[len(quantity) + 1 :]
             unit = find_limited(quantity).unit_of(arm)

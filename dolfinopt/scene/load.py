@@ -652,7 +652,7 @@ def _freeze_loads(tree: dict[str, Any]) -> Keys:
         return ()
     limited = [key for key, limit in limits.items() if limit is not None]
     if objective.get("kind", Objective.model_fields["kind"].default) != "esl" or any(
-        one.key in limited and "motion" in one.needs for one in DECLARED.values()
+        response.key in limited and "motion" in response.needs for response in DECLARED.values()
     ):
         return ()
     tree["objective"] = {**objective, "gradient": "esl"}

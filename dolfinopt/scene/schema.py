@@ -275,7 +275,9 @@ class Scene(Table):
     def rigid_units(self) -> dict[str, str]:
         """Unit of every rigid coordinate by its name: cart, then the arms; in space the joints."""
         if self.is_spatial:
-            units = {one.name: "m" if one.type == "prismatic" else "rad" for one in self.movable}
+            units = {
+                joint.name: "m" if joint.type == "prismatic" else "rad" for joint in self.movable
+            }
             return units | {rod.name: "m" for rod in self.rods}
         return {"cart": "m", **{arm.name: "rad" for arm in self.arms}}
 

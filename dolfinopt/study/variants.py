@@ -184,7 +184,7 @@ def posed(scene: Scene, kind: str) -> Scene:
 
 def _drop_unused(tree: dict[str, Any]) -> None:
     """Take out of a scene's data what its objective and its limits do not use."""
-    keys = {one.key for one in DECLARED.values()}
+    keys = {response.key for response in DECLARED.values()}
     limited = [k for k, limit in tree["constraints"].items() if limit is not None and k in keys]
     for key in unused_options(list(tree["objective"]), tree["objective"]["kind"], limited):
         tree["objective"].pop(key, None)

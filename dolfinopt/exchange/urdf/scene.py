@@ -280,7 +280,9 @@ class RobotScene:
         """Return where the loops' assembly begins, the joints in the scene's order."""
         if not self.loops.closures:
             return []
-        start = dict(zip((one.name for one in self.robot.movable), self.start_joints, strict=True))
+        start = dict(
+            zip((joint.name for joint in self.robot.movable), self.start_joints, strict=True)
+        )
         order = [body.joint.name for body in self.bodies if body.joint.moves]
         return [f"initial_joints = {_list(start[name] for name in order)}  # near the way it is"]
 

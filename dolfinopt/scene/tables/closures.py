@@ -260,7 +260,7 @@ class Closures(Table):
             if force.name == OLD:
                 reason = "expected 0.0, the default, with a pin: its end does not move"
                 raise Refusal(reason, f"forces.{n}.factor", ".kind")
-        for key in set(OF_THE_END).intersection(one.name for one in asked(scene)):
+        for key in set(OF_THE_END).intersection(response.name for response in asked(scene)):
             place = "objective.kind" if scene.objective.kind == key else f"constraints.{key}"
             raise Refusal(
                 "expected another response with a pin: the end of the last arm is held, it "

@@ -342,7 +342,7 @@ class ConstraintOptions(Table):
             if one.of_arms:
                 where = f".{one.key}" if one.key in self.limits else "objective.kind"
                 raise Refusal("expected another response: no arm is flexible", where)
-        for one in (one for one in asked(scene) if one.name == "stress"):
+        for one in (response for response in asked(scene) if response.name == "stress"):
             for name, kind in scene.without_strength.items():
                 where = f".{one.key}" if one.key in self.limits else "objective.kind"
                 raise Refusal(
@@ -353,7 +353,7 @@ class ConstraintOptions(Table):
 
     def _check_poles(self, scene: Scene) -> None:
         """Refuse responses of poles without a closed loop, and options of none."""
-        used = [one.name for one in asked(scene) if "poles_at" in one.options]
+        used = [response.name for response in asked(scene) if "poles_at" in response.options]
         options = ("damping_below", "poles_at")
         for key in unused_options(options, scene.objective.kind, self.limits):
             if getattr(self, key) is not None:

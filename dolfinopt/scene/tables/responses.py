@@ -420,7 +420,7 @@ OLD_LIMITS = {"esl": "compliance"}
 
 def objective_kinds() -> list[str]:
     """Return the words of objective.kind."""
-    return [one.name for one in DECLARED.values() if one.objective]
+    return [response.name for response in DECLARED.values() if response.objective]
 
 
 def limited_by(key: str) -> Declaration:
@@ -435,17 +435,17 @@ def asked(scene: Scene) -> list[Declaration]:
 
 def need_of(scene: Scene, what: Need) -> list[Declaration]:
     """Return those of `asked` that need that."""
-    return [one for one in asked(scene) if what in one.needs]
+    return [response for response in asked(scene) if what in response.needs]
 
 
 def needs_alone(scene: Scene, what: Iterable[Need]) -> bool:
     """Return whether nothing of `asked` needs anything else."""
-    return all(one.needs <= frozenset(what) for one in asked(scene))
+    return all(response.needs <= frozenset(what) for response in asked(scene))
 
 
 def freezes(scene: Scene) -> bool:
     """Return whether a gradient of the scene differs with frozen loads from the exact one."""
-    return any(not one.exact for one in need_of(scene, "motion"))
+    return any(not response.exact for response in need_of(scene, "motion"))
 
 
 def users_of(option: str) -> tuple[list[str], list[str]]:
