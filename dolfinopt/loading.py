@@ -33,9 +33,9 @@ def load_scene(
         scene = scene_from_dict(source, overrides=overrides)
     else:
         scene = read_scene(source, overrides)
-    for one in (scene, *pose_scenarios(scene)):
-        check_motion(one)
-        check_forces(one)
+    for item in (scene, *pose_scenarios(scene)):
+        check_motion(item)
+        check_forces(item)
     for index, arm in enumerate(scene.arms):
         if arm.sid is not None:
             fixed_body(scene, index)
@@ -53,20 +53,20 @@ def doubts_of_files(scene: Scene) -> list[str]:
     Raises:
         InputError: a file holds no such body.
     """
-    found = []
+    result = []
     for index, arm in enumerate(scene.arms):
         if arm.sid is None:
             continue
         body = fixed_body(scene, index)
         if scene.simulation.stiffening is True and not body.is_stiffened:
-            found.append(
+            result.append(
                 f"{arm.sid} holds no geometric stiffness, which simulation.stiffening = true asks "
                 f"for: arm {arm.name!r} is linear"
             )
         out_of_plane = body.outboard[2:-1]  # no rows of plane bodies
         if len(out_of_plane) and not out_of_plane.any():
-            found.append(
+            result.append(
                 f"{arm.sid}: its outboard node moves in x and y and turns about z alone; out of "
                 f"that plane arm {arm.name!r} is rigid"
             )
-    return found
+    return result

@@ -379,9 +379,9 @@ class Model:
         place = self._under_law(x), partition, arms, x_phys
         choice = choose_coordinates(*place, self._profile)
         evaluation, trajectory = evaluate(*place, self._profile)
-        found = stress_report(partition, arms, trajectory, self._profile) if stress else None
-        views = gather_views(*place, found)
-        points = [one.peak_at_points.value for one in (found or {}).values()]
+        result = stress_report(partition, arms, trajectory, self._profile) if stress else None
+        views = gather_views(*place, result)
+        points = [item.peak_at_points.value for item in (result or {}).values()]
         return SimulationResult(
             scene=place[0],
             evaluation=evaluation,
@@ -416,8 +416,8 @@ class Model:
             choose_coordinates(scene, partition, arms, x_phys, self._profile)
         _, trajectory = evaluate(scene, partition, arms, x_phys, self._profile, simulated=False)
         zero = {k: np.zeros_like(x_phys[k]) for k in arms}
-        found = gradient(scene, partition, arms, trajectory, self._profile)
-        return self._gathered(zero | found)
+        result = gradient(scene, partition, arms, trajectory, self._profile)
+        return self._gathered(zero | result)
 
     def evaluate(self, x: Design = None) -> Responses:
         """Return objective and limits of a design with their gradients, for a loop of one's own.
@@ -442,8 +442,8 @@ class Model:
         return Responses(
             dict(zip(names, values, strict=True)),
             {
-                name: self._gathered(zero | dict(one))
-                for name, one in zip(names, by_cells, strict=True)
+                name: self._gathered(zero | dict(cell))
+                for name, cell in zip(names, by_cells, strict=True)
             },
         )
 
@@ -500,7 +500,7 @@ class Model:
         partition, arms = self._arms()
         first = None if x0 is None else self._prepared(x0)[2]
         built = partition, {k: arm.fresh() for k, arm in arms.items()}
-        found = optimize(
+        result = optimize(
             self.scene,
             place,
             resume=resume,
@@ -511,13 +511,13 @@ class Model:
             x0=first,
         )
         if place is not None:
-            write_result(place, found, time.perf_counter() - begun)
-        stress = stress_report(found.partition, found.arms, found.trajectory, found.profile)
+            write_result(place, result, time.perf_counter() - begun)
+        stress = stress_report(result.partition, result.arms, result.trajectory, result.profile)
         return OptimizationResult(
-            **_fields(found),
-            design=self._gathered(found.x_phys, found.partition),
-            views=gather_views(self.scene, found.partition, found.arms, found.x_phys, stress),
-            filtered=self._gathered(found.x_filtered or {}, found.partition),
+            **_fields(result),
+            design=self._gathered(result.x_phys, result.partition),
+            views=gather_views(self.scene, result.partition, result.arms, result.x_phys, stress),
+            filtered=self._gathered(result.x_filtered or {}, result.partition),
         )
 
     def save(
@@ -613,18 +613,18 @@ class Model:
         with self._folder(None) as place:
             self._design_file(x, place / "design.npz")
             curves = self._curves(tool_radius, tolerance)
-            found = make_parts(self.scene, place, curves, self._world)
+            result = make_parts(self.scene, place, curves, self._world)
         asked = self.scene.part
         with together(self._world):
             if self._world.rank == 0:
                 if asked.optimize if optimize is None else optimize:
-                    given = self.scene, found, asked.iterations, lambda _: None, asked.starts
-                    found = optimize_parts(*given).best.parts
+                    given = self.scene, result, asked.iterations, lambda _: None, asked.starts
+                    result = optimize_parts(*given).best.parts
                 if out is not None:
                     prepare_folder(out)
-                    meshes = mesh_parts(found, coarse=False).fine
-                    write_parts(out, self.scene, found, meshes)
-        return {self.scene.arms[k].name: part for k, part in found.items()}
+                    meshes = mesh_parts(result, coarse=False).fine
+                    write_parts(out, self.scene, result, meshes)
+        return {self.scene.arms[k].name: part for k, part in result.items()}
 
     def _curves(self, tool_radius: float | None, tolerance: float | None) -> Curves:
         """Return what is asked of the parts' curves, by the scene where nothing else is."""
@@ -663,11 +663,12 @@ class Model:
 
         with self._folder(folder) as place:
             paths = [
-                self._design_file(one, place / f"design{k}.npz") for k, one in enumerate(designs, 1)
+                self._design_file(design, place / f"design{k}.npz")
+                for k, design in enumerate(designs, 1)
             ]
             runner = Runner(place, self._world, shown)
-            found = study(self.scene, preset, vary, paths, runner, reoptimize=reoptimize)
-            frame: DataFrame = self._world.bcast(found.tables[0].frame, root=0)
+            result = study(self.scene, preset, vary, paths, runner, reoptimize=reoptimize)
+            frame: DataFrame = self._world.bcast(result.tables[0].frame, root=0)
         return frame
 
     # -- designs over the ranks ----------------------------------------------------------------
@@ -717,8 +718,8 @@ class Model:
         """Return a user's densities in the order of the ranks' cells (root only)."""
         names = [self.scene.arms[k].name for k in self._order]
         if not isinstance(x, Mapping) or sorted(x) != sorted(names):
-            found = ", ".join(map(str, x)) if isinstance(x, Mapping) else type(x).__name__
-            raise InputError(f"design: expected densities of {', '.join(names)}, found {found}")
+            result = ", ".join(map(str, x)) if isinstance(x, Mapping) else type(x).__name__
+            raise InputError(f"design: expected densities of {', '.join(names)}, found {result}")
         whole = {}
         for (k, order), name in zip(self._order.items(), names, strict=True):
             values = np.asarray(x[name])
@@ -739,10 +740,10 @@ class Model:
 
         Derivatives by the variables of the motion's law are called "motion".
         """
-        of_arms = {k: one for k, one in cells.items() if k != LAW}
+        of_arms = {k: cell for k, cell in cells.items() if k != LAW}
         whole = gather_cells(partition or self._arms()[0], of_arms)
-        found = {self.scene.arms[k].name: one[self._order[k]] for k, one in whole.items()}
-        return found | {"motion": cells[LAW]} if whole and LAW in cells else found
+        result = {self.scene.arms[k].name: item[self._order[k]] for k, item in whole.items()}
+        return result | {"motion": cells[LAW]} if whole and LAW in cells else result
 
     @contextmanager
     def _folder(self, folder: str | Path | None) -> Iterator[Path]:
@@ -760,8 +761,8 @@ class Model:
             yield on_root(self._world, make)
             self._world.barrier()
         finally:
-            for one in held:
-                one.cleanup()
+            for item in held:
+                item.cleanup()
 
     def _design_file(self, x: Densities | SimulationResult | str | Path, path: Path) -> Path:
         """Return the path of a file with the design, this one if it is in none yet (collective)."""
@@ -773,10 +774,10 @@ class Model:
             values = x.design if isinstance(x, SimulationResult) else x
             self._checked(values)
             path.parent.mkdir(parents=True, exist_ok=True)
-            arrays = {f"{name}/density": np.asarray(one) for name, one in values.items()}
-            arrays |= {f"{name}/centroid": one for name, one in self._centroids.items()}
+            arrays = {f"{name}/density": np.asarray(value) for name, value in values.items()}
+            arrays |= {f"{name}/centroid": centroid for name, centroid in self._centroids.items()}
             if isinstance(x, SimulationResult):
-                arrays |= {f"{name}/filtered": one for name, one in x.filtered.items()}
+                arrays |= {f"{name}/filtered": item for name, item in x.filtered.items()}
             write_arrays(path, arrays)
             return path
 
@@ -788,7 +789,7 @@ def _load(
     changes: Sequence[str | Mapping[str, Any]],
 ) -> Scene:
     """Read and check a scene (root only)."""
-    overrides = [text for one in changes for text in _texts(one)]
+    overrides = [text for change in changes for text in _texts(change)]
     if isinstance(scene, Scene) and not overrides:
         return scene
     return load_scene(scene, overrides)

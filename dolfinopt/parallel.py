@@ -195,8 +195,8 @@ def together(comm: MPI.Comm) -> Iterator[None]:
     if not failed[0]:
         return
     outcomes = comm.allgather(None if failure is None else _packed(failure, comm.rank))
-    known = [one for one in outcomes if one is not None]
-    chosen = next((one for one in known if not one.gave_up), known[0])
+    known = [outcome for outcome in outcomes if outcome is not None]
+    chosen = next((item for item in known if not item.gave_up), known[0])
     if failure is not None and chosen.rank == comm.rank:
         raise failure
     raise chosen.exception() from chosen.cause()

@@ -59,4 +59,4 @@ SHOWN = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "Pa": ("MPa", 1e-6)}  # units o
 def shown(values: Sequence[float], unit: str) -> tuple[tuple[float, ...], str]:
     """Return values of a unit in that in which they are shown, and this unit."""
     other, factor = SHOWN.get(unit, (unit, 1.0))
-    return tuple(factor * one for one in values), other
+    return tuple(factor * value for value in values), other

@@ -85,14 +85,14 @@ class BandCholesky:
 
         def below(j: int, count: int) -> list[tuple[slice, np.ndarray]]:
             """Return the blocks below the diagonal one of columns j and on: whole, triangular."""
-            end, found = min(j + width, size), []
+            end, result = min(j + width, size), []
             if end > j + count:
                 rows = slice(j + count, end)
-                found.append((rows, block(j + count, j, end - j - count, count)))
+                result.append((rows, block(j + count, j, end - j - count, count)))
             if (last := min(end + count - 1, size)) > end:
                 part = block(end, j, last - end, count)
-                found.append((slice(end, last), np.triu(part, 1)))
-            return found
+                result.append((slice(end, last), np.triu(part, 1)))
+            return result
 
         starts = range(0, size, BLOCK_COLUMNS)
         for j in starts:
@@ -149,13 +149,13 @@ class PetscFactor:
         sizes, comm = self.ksp.getOperators()[0].getSizes()[0], self.ksp.comm
         shape = (sizes, (PETSc.DECIDE, right.shape[1]))
         given = PETSc.Mat().createDense(shape, array=np.asfortranarray(right), comm=comm)
-        found = PETSc.Mat().createDense(shape, comm=comm)
-        found.setUp()
-        self.ksp.getPC().matApply(given, found)
+        result = PETSc.Mat().createDense(shape, comm=comm)
+        result.setUp()
+        self.ksp.getPC().matApply(given, result)
         self.failed = False
-        out = found.getDenseArray().copy()
+        out = result.getDenseArray().copy()
         given.destroy()
-        found.destroy()
+        result.destroy()
         return out
 
 

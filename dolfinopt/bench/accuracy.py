@@ -54,8 +54,8 @@ def _tips(plan: Plan) -> Steps:
     right = cache(partial(tip_compliance, plan.scene, FINEST, TIP_REFERENCE))
 
     def row(element: str, cells: Cells) -> Rows:
-        found, dofs, seconds = tip_compliance(plan.scene, element, cells)
-        yield element, f"{cells[0]} x {cells[1]}", dofs, seconds, abs(found / right()[0] - 1.0)
+        result, dofs, seconds = tip_compliance(plan.scene, element, cells)
+        yield element, f"{cells[0]} x {cells[1]}", dofs, seconds, abs(result / right()[0] - 1.0)
 
     for element in get_args(ElementName):
         for cells in TIP_CELLS[: 2 if plan.quick else None]:
@@ -315,11 +315,11 @@ def compared(cells: Row, problem: MachineSystem) -> Rows:
             runs[tolerance] = None
     done = [run for run in runs.values() if run]
     right = reference(problem, done[-1]).sample(t) if done else np.empty(0)
-    for tolerance, found in runs.items():
+    for tolerance, result in runs.items():
         row = np.inf, np.inf, 0
-        if found:
-            true = relative_error(problem.mechanism, found.sample(t) - right, right)
-            row = found.error, true, len(found.a)
+        if result:
+            true = relative_error(problem.mechanism, result.sample(t) - right, right)
+            row = result.error, true, len(result.a)
         yield *cells, tolerance, *row
 
 

@@ -272,11 +272,17 @@ def table_of(found: Sequence[Checked]) -> pd.DataFrame:
     sign = {"near": "", "most": "at most +", "least": "at least -"}
     rows = [
         (
-            *(one.case.name, one.of.what, one.of.unit, f"{one.value:.6g}", f"{one.reference:.6g}"),
-            *(f"{one.difference:.2g}", f"{sign[one.of.way]}{one.of.limit:g}"),
-            "met" if one.met else "MISSED",
+            *(
+                item.case.name,
+                item.of.what,
+                item.of.unit,
+                f"{item.value:.6g}",
+                f"{item.reference:.6g}",
+            ),
+            *(f"{item.difference:.2g}", f"{sign[item.of.way]}{item.of.limit:g}"),
+            "met" if item.met else "MISSED",
         )
-        for one in found
+        for item in found
     ]
     columns = "case value unit computed reference difference limit verdict"
     return pd.DataFrame(rows, columns=columns.split())

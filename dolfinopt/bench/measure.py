@@ -106,12 +106,12 @@ def in_processes(
 
 def _main(module: str, name: str, text: str) -> None:
     comm, (scene, *given) = MPI.COMM_WORLD, json.loads(text)
-    found = getattr(import_module(module), name)(comm, scene_from_dict(scene), *given)
+    result = getattr(import_module(module), name)(comm, scene_from_dict(scene), *given)
     # Not by getrusage, which inherits the peak of the parent; kB.
     peak = Path("/proc/self/status").read_text(encoding="utf-8").partition("VmHWM:")[2].split()[0]
     memory = comm.allreduce(float(peak) / 1024.0)
     if comm.rank == 0:
-        print(json.dumps([found, memory]), flush=True)
+        print(json.dumps([result, memory]), flush=True)
 
 
 if __name__ == "__main__":

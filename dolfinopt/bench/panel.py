@@ -83,7 +83,7 @@ def figure_of(diagram: Diagram, frame: Frame) -> LineFigure:
     for values, part in groups:
         title = ", ".join(f"{k}: {v}" for k, v in zip(diagram.each, values))
         for y in diagram.y:
-            found = curves(part, diagram.x, y, diagram.by)
-            lines = [Line(name, *points.to_numpy().T) for name, points in found.items()]
+            result = curves(part, diagram.x, y, diagram.by)
+            lines = [Line(name, *points.to_numpy().T) for name, points in result.items()]
             panels.append(Panel(title, diagram.x, y, tuple(lines), log=True))
     return LineFigure(diagram.name, diagram.title, tuple(panels))

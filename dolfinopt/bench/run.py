@@ -31,7 +31,7 @@ NAMED = iterations.OPTIMISER, solid.SOLID, solid.STATICS
 
 def named(names: Sequence[str]) -> tuple[Diagram, ...]:
     """Return the diagrams of these names; all of plane arms for none."""
-    known = {one.name: one for one in (*DIAGRAMS, *NAMED)}
+    known = {item.name: item for item in (*DIAGRAMS, *NAMED)}
     if wrong := [name for name in names if name not in known]:
         raise InputError(f"bench: no diagram {wrong[0]!r}: expected {' | '.join(known)}")
     return tuple(known[name] for name in names) or DIAGRAMS
@@ -55,7 +55,7 @@ def bench(
             frame = frames[diagram.name] = diagram.frame(rows)
             parts.append(write(diagram, frame, folder))
         told = [f"Failed: {failure}" for failure in failures]
-        told += [f"Not finished: {one.name} is missing." for one in diagrams[k:]]
+        told += [f"Not finished: {item.name} is missing." for item in diagrams[k:]]
         if len(goals := goal_table(frames)):
             coarse = "A quick bench is coarser than what some goals are about." * plan.quick
             told += ["## Goals", Table("goals", coarse, goals).markdown().strip()]
@@ -74,8 +74,8 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[li
     stamp = json.loads(json.dumps(asked))
     kept: dict[str, list[Row]] = {}
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        kept = found["rows"] if found["stamp"] == stamp else {}
+        result = json.loads(path.read_text(encoding="utf-8"))
+        kept = result["rows"] if result["stamp"] == stamp else {}
     except (OSError, ValueError, KeyError, TypeError):
         pass  # not there, or cut off: measured anew
     failures: list[str] = []
@@ -146,9 +146,9 @@ def _superiority(coordinates: int, frame: Frame) -> float:
     here = frame[frame["coordinates per arm"] == coordinates]
     theirs = here[here["method"].str.startswith("SciPy")]
     ratios = [
-        least_x(points, one[accuracy.ERROR]) / one[accuracy.SECONDS]
-        for _, one in here.query(USUAL).iterrows()
-        for points in curves(theirs[theirs["design"] == one["design"]], *accuracy.CURVES).values()
+        least_x(points, item[accuracy.ERROR]) / item[accuracy.SECONDS]
+        for _, item in here.query(USUAL).iterrows()
+        for points in curves(theirs[theirs["design"] == item["design"]], *accuracy.CURVES).values()
     ]
     return min(ratios, default=math.nan)
 

@@ -143,8 +143,8 @@ def _statics(plan: Plan) -> Steps:
 def _links(plan: Plan) -> Steps:
     def rows(who: str, cells: Cells, ranks: int) -> Rows:
         link = plain_link if who == PLAIN else iterate_link
-        (dofs, solver, found), memory = in_processes(link, plan.scene, cells, ranks=ranks)
-        for name, seconds in zip([PLAIN] if who == PLAIN else OURS, found, strict=True):
+        (dofs, solver, result), memory = in_processes(link, plan.scene, cells, ranks=ranks)
+        for name, seconds in zip([PLAIN] if who == PLAIN else OURS, result, strict=True):
             yield name, ranks, dofs, seconds, memory * 2**20 / 1e9, solver
 
     for ranks, cells in product((1, 2) if mpirun() else (1,), QUICK if plan.quick else CELLS):

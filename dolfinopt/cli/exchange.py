@@ -283,8 +283,8 @@ def import_robot(
 
                 model = _robot(robot, package_path)
                 write_mesh = None if boxes else msh_bytes
-                found = scene_of_robot(model, chosen, tool, table, closures, write_mesh, warn)
-            _write_scene(out or Path(robot.stem), overwrite, *found)
+                result = scene_of_robot(model, chosen, tool, table, closures, write_mesh, warn)
+            _write_scene(out or Path(robot.stem), overwrite, *result)
 
 
 def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
@@ -323,7 +323,7 @@ def _write_scene(
     )
     for body in scene.bodies:
         if body.size is not None:
-            sides = " x ".join(f"{one:.3g}" for one in (body.length, *body.size))
+            sides = " x ".join(f"{item:.3g}" for item in (body.length, *body.size))
             box = "a box to edit" if body.measured else "a box of guessed height and thickness"
             what = box if body.mesh is None else f"its shape, {body.mesh.cells} cells"
             click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}; {scene.masses(body)}")
@@ -435,11 +435,11 @@ def _links(world: MPI.Comm, run: _Run) -> _Links:
     bodies = _reduced(world, made, machine, None).bodies
     if world.rank:
         return {}
-    files = {one.name: made / f"{_owner(run.scene, one.name)}.stl" for one in machine.arms}
+    files = {item.name: made / f"{_owner(run.scene, item.name)}.stl" for item in machine.arms}
     return {
-        one.name: (bodies[k], _surface(files[one.name]))
-        for k, one in enumerate(machine.arms)
-        if k in bodies and files[one.name].is_file()
+        item.name: (bodies[k], _surface(files[item.name]))
+        for k, item in enumerate(machine.arms)
+        if k in bodies and files[item.name].is_file()
     }
 
 
@@ -493,11 +493,11 @@ def _sides(world: MPI.Comm, before: Path, after: _Run) -> list[Any]:
     from dolfinopt.study.before_after import read_side
 
     sides = []
-    for one in (_reduced(world, before, on_root(world, scene_of, before)), after):
-        views = gather_views(one.scene, one.partition, one.arms, one.x_phys)
+    for item in (_reduced(world, before, on_root(world, scene_of, before)), after):
+        views = gather_views(item.scene, item.partition, item.arms, item.x_phys)
         with together(world):
             if world.rank == 0:
-                sides.append(read_side(one.folder, one.scene, views, one.bodies))
+                sides.append(read_side(item.folder, item.scene, views, item.bodies))
     return sides
 
 
@@ -658,7 +658,7 @@ def export(
         given |= _last_word(kind, chosen, last)
     for name, value in given.items():
         if value not in (None, ()) and name not in chosen.options:
-            users = " or ".join(word for word, one in FORMATS.items() if name in one.options)
+            users = " or ".join(word for word, item in FORMATS.items() if name in item.options)
             raise InputError(f"--{name}: expected with {users}, not with {kind}")
     chosen.write(scene, out, overwrite, *(given[name] for name in chosen.options))
 

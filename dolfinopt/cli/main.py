@@ -68,7 +68,7 @@ def init(name: Path, template: str, older: str | None) -> None:
         texts[path.with_suffix(source.suffix)] = text
     schema = path.with_name(SCHEMA_FILE)
     write_new(texts, {schema: json.dumps(scene_schema(), indent=2) + "\n"})
-    written = ", ".join(os.fspath(one) for one in texts)
+    written = ", ".join(os.fspath(item) for item in texts)
     click.echo(f"{written}: edit the values that differ for your machine")
     click.echo(f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)")
     if template == "step":
@@ -109,16 +109,16 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
         click.echo(json.dumps(scene_schema(), indent=2))
         return
     known = describe_keys()
-    found = [info for info in known if _fits(info, pattern)]
-    materials = _materials(pattern, found)
-    if not found and not materials:
+    result = [info for info in known if _fits(info, pattern)]
+    materials = _materials(pattern, result)
+    if not result and not materials:
         near = difflib.get_close_matches(str(pattern), [info.key for info in known], 3)
         near += difflib.get_close_matches(
             str(pattern), sorted({part for info in known for part in info.key.split(".")}), 3
         )
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(f"{pattern}: no such key; {hint}dolfinopt keys lists all of them")
-    click.echo("\n".join([*map(_explained, found), *materials]))
+    click.echo("\n".join([*map(_explained, result), *materials]))
 
 
 def _upgrade(scene: Path) -> None:
@@ -172,7 +172,7 @@ def _in_units(value: float | tuple[float, ...] | None, unit: float) -> str:
     if value is None:
         return "-"
     values = value if isinstance(value, tuple) else (value,)
-    return "/".join(f"{one / unit:.4g}" for one in values)
+    return "/".join(f"{item / unit:.4g}" for item in values)
 
 
 def _explained(info: KeyInfo) -> str:
@@ -235,7 +235,7 @@ class _Commands(click.Group):
         for title, group in GROUPS.items():
             with formatter.section(title):
                 formatter.write_dl(
-                    [(str(one.name), one.get_short_help_str(60)) for one in group], col_max=14
+                    [(str(item.name), item.get_short_help_str(60)) for item in group], col_max=14
                 )
 
     def main(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]

@@ -133,12 +133,12 @@ def part(
             if error.parts:
                 say("files")
                 Made(scene, error.parts, None).write(folder, target, plots)
-                names = ", ".join(one.name for one in error.parts.values())
+                names = ", ".join(item.name for item in error.parts.values())
                 warn([f"only files of {names} in {target}"])
             raise
         with together(world):
             if world.rank == 0:
-                warn(dict.fromkeys(text for one in parts.values() for text in one.warnings))
+                warn(dict.fromkeys(text for item in parts.values() for text in item.warnings))
                 made = Made(scene, parts, _meshes(parts, check or asked.optimize, say))
                 made = made.checked(folder, say) if check else made
                 if asked.optimize and made.meshes is not None:
@@ -230,9 +230,9 @@ class Made:
         with _ended_as_interrupted():
             given = self.scene, self.parts, asked.iterations, tell, asked.starts
             before = None if self.check is None else self.check.part
-            found = optimize_parts(*given, keep, known, before)
-        click.echo("\n".join(found.sentences))
-        after = replace(self, parts=found.parts, meshes=found.meshes, shape=found)
+            result = optimize_parts(*given, keep, known, before)
+        click.echo("\n".join(result.sentences))
+        after = replace(self, parts=result.parts, meshes=result.meshes, shape=result)
         return after.checked(run, say) if check else after
 
     def write(self, run: Path, target: Path, plots: bool) -> None:
@@ -257,7 +257,7 @@ class Made:
         from dolfinopt.plots.style import save
 
         scene = self.scene
-        masses = [scene.material_of(k).density * one.volume for k, one in self.parts.items()]
+        masses = [scene.material_of(k).density * item.volume for k, item in self.parts.items()]
         own = self.shape is not None and self.shape.best.start.startswith(TRUSSES)
         picture = parts_figure(list(self.parts.values()), scene.name, masses, own)
         save(picture, folder / "part.png")

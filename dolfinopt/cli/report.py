@@ -55,11 +55,11 @@ def _budget(summary: Summary, table: bool) -> Iterator[str]:
         f"at {budget['instant']:.3f} s, {1e3 * budget['linear']:.4g} mm to first order "
         f"({1e3 * budget['deviation']:.4g} mm simulated):"
     )
-    width = max(len(one["name"]) for one in budget["parts"])
-    for one in budget["parts"]:
+    width = max(len(item["name"]) for item in budget["parts"])
+    for item in budget["parts"]:
         yield (
-            f"  {one['kind']:<8} {one['name']:<{width}} {1e3 * one['deflection']:>10.4g} mm "
-            f"{100.0 * one['share']:>6.1f} %"
+            f"  {item['kind']:<8} {item['name']:<{width}} {1e3 * item['deflection']:>10.4g} mm "
+            f"{100.0 * item['share']:>6.1f} %"
         )
 
 
@@ -80,9 +80,9 @@ def _choices(summary: Summary) -> Iterator[str]:
             f"({1e3 * moved['deviation_without']:.4g} mm without, to first order); "
             "feed_forward.csv has the joints"
         )
-    found = summary["reduction"]
-    if found["error_estimate"] is not None:
-        yield chosen(found["coordinates"], found["error_estimate"])
+    result = summary["reduction"]
+    if result["error_estimate"] is not None:
+        yield chosen(result["coordinates"], result["error_estimate"])
     loads, asked = summary["stiffening"], summary["scene"]["simulation"]["stiffening"]
     if asked == "auto" and loads is not None and loads["on"]:
         yield (
@@ -103,7 +103,7 @@ def _objective(result: Result, summary: Summary) -> str:
         text += f" ({summary['designed_mass']:.4g} kg of it designed)"
     if response.stands_for:
         frequencies = summary["loaded_frequency"].items()
-        shown = ", ".join(f"{arm} {one:.4g} {response.limit_unit}" for arm, one in frequencies)
+        shown = ", ".join(f"{arm} {item:.4g} {response.limit_unit}" for arm, item in frequencies)
         text += f" ({response.stands_for} of {shown})"
     if not result.optimised:
         return text
@@ -131,7 +131,7 @@ def _against_bars(result: Result, value: float) -> str:
         for limit in limits_of(result.scene, result.bars)
         if limit.excess > 0.01 and not limit.of_mass
     ]
-    missed = ", ".join(one.usage for one in exceeded)
+    missed = ", ".join(item.usage for item in exceeded)
     if result.scene.objective.kind == "mass":
         return f"{bars} have {missed}" if missed else f"as {bars}, which keep the limits, too"
     text = _against(value, result.bars.objective, bars)
@@ -140,7 +140,7 @@ def _against_bars(result: Result, value: float) -> str:
 
 def _largest(summary: Summary) -> str:
     """Return the largest deviation, or of a pinned end the pin's force, and the largest stress."""
-    kinds, stress = [one["kind"] for one in summary["scene"]["closures"]], summary["stress"]
+    kinds, stress = [item["kind"] for item in summary["scene"]["closures"]], summary["stress"]
     if kinds == ["pin"] and "closure_force_peak" in summary:
         text = f"largest force of the pin {summary['closure_force_peak']:.4g} N"
     else:
@@ -167,10 +167,10 @@ def _limits(limits: Sequence[Limit]) -> Iterator[str]:
 def _details(summary: Summary) -> Iterator[str]:
     """Yield grayness, contacts of the design cut at one half, and the certificate."""
     yield f"grayness {summary['grayness']:.3f}"
-    for arm, one in summary["contacts"].items():
-        if count := one["corners"] + one["edges"]:
+    for arm, item in summary["contacts"].items():
+        if count := item["corners"] + item["edges"]:
             yield (
-                f"cut at a density of 0.5, {arm} falls into {one['pieces']} pieces, "
+                f"cut at a density of 0.5, {arm} falls into {item['pieces']} pieces, "
                 f"{count} of whose contacts are corners or edges of cells alone"
             )
     if summary["certificate"] is not None:

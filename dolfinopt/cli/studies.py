@@ -302,9 +302,9 @@ def reproduce(
 
     def conclude() -> None:
         paper.write_report(plan, results, outcomes, checks, folder, plots=plots)
-        for one in checks:
-            click.echo(f"{one.name} (paper: {one.paper}). {one.sentence}")
-        click.echo(f"{sum(one.holds for one in checks)} of {len(checks)} statements hold")
+        for item in checks:
+            click.echo(f"{item.name} (paper: {item.paper}). {item.sentence}")
+        click.echo(f"{sum(entry.holds for entry in checks)} of {len(checks)} statements hold")
         page = " and report.html" if plots else ""
         click.echo(f"{outcomes.computed} cases computed; figures{page} in {folder}")
 
@@ -369,22 +369,24 @@ def _check_field(
     from dolfinopt.disk import write_text
     from dolfinopt.parallel import on_root
 
-    found = []
+    result = []
     for case in chosen_cases(names, records is not None):
         checked = on_root(world, check, case, records)
-        found += checked
+        result += checked
         if world.rank == 0:
             table = table_of(checked).drop(columns="case").to_string(index=False)
             click.echo(f"{case.title} ({case.name})\n{table}\n")
     if out is not None:
         prepare(world, out)
-        on_root(world, write_text, out / "field.csv", table_of(found).to_csv(index=False))
-    missed = [one for one in found if not one.met]
+        on_root(world, write_text, out / "field.csv", table_of(result).to_csv(index=False))
+    missed = [item for item in result if not item.met]
     if missed:
-        named = ", ".join(f"{one.case.name}: {one.of.what}" for one in missed)
-        raise ConvergenceError(f"bench field: {len(missed)} of {len(found)} limits missed: {named}")
+        named = ", ".join(f"{item.case.name}: {item.of.what}" for item in missed)
+        raise ConvergenceError(
+            f"bench field: {len(missed)} of {len(result)} limits missed: {named}"
+        )
     if world.rank == 0:
-        click.echo(f"{len(found)} values within their limits")
+        click.echo(f"{len(result)} values within their limits")
 
 
 def _measure(names: tuple[str, ...], out: Path | None, quick: bool) -> None:

@@ -282,7 +282,7 @@ def _stiffening(body: ShapeIntegrals, outboard: np.ndarray) -> tuple[np.ndarray,
         return np.zeros(0, dtype=int), np.zeros((0, q, q))
     rotation = body.K0[3:].reshape(3, 3, q, q)
     inertial = [centrifugal(rotation), turning(rotation), body.K0[:3].transpose(1, 2, 0)]
-    matrices = [0.0 - np.moveaxis(one, -1, 0) for one in inertial]
+    matrices = [0.0 - np.moveaxis(item, -1, 0) for item in inertial]
     result = np.concatenate([*matrices, outboard])
     acting = result.any(axis=(1, 2))
     return 1 + np.flatnonzero(acting), result[acting]
@@ -322,8 +322,8 @@ def load_body(
             else:
                 where, told = "the outboard node", f"the arm's length is {length:.7g} m"
                 told += f"; it must be at (length{', 0' * (dimension - 1)})"
-            found = ", ".join(f"{x:.7g}" for x in point)
-            raise InputError(f"{path}: {where} is at ({found}) m, but {told}")
+            result = ", ".join(f"{x:.7g}" for x in point)
+            raise InputError(f"{path}: {where} is at ({result}) m, but {told}")
     return body
 
 
@@ -615,13 +615,13 @@ def _is_stiffened(
     along, _ = _axes(dimension)
     excess, Me = _centrifugal_excess(data, dimension), data.Me.M0
     rotation = bool(np.abs(excess).max() > CENTRIFUGAL_EXCESS_SHARE * np.abs(Me).max())
-    found = {"m1 of Ct": bool(_first_order(data.Ct)[:, :, along].any())}
+    result = {"m1 of Ct": bool(_first_order(data.Ct)[:, :, along].any())}
     if dimension == 2:
-        found["m1 of Oe beyond -Me"] = rotation
+        result["m1 of Oe beyond -Me"] = rotation
     for tip in tips:
-        found[f"m1 of phi of node {tip.name}"] = bool(_first_order(tip.phi)[along].any())
-    present = [name for name in found if found[name]]
-    lacking = [name for name in found if not found[name]]
+        result[f"m1 of phi of node {tip.name}"] = bool(_first_order(tip.phi)[along].any())
+    present = [name for name in result if result[name]]
+    lacking = [name for name in result if not result[name]]
     if present and lacking:
         raise InputError(
             f"{source}: {present[0]} holds geometric stiffening, which {lacking[0]} lacks; write "

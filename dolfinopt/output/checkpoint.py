@@ -102,9 +102,9 @@ def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
     result = hashlib.blake2b(digest_size=16)
     for key in sorted(arrays):
-        one = arrays[key]
-        result.update(f"{key} {one.dtype.str} {one.shape}".encode())
-        result.update(one.tobytes())
+        array = arrays[key]
+        result.update(f"{key} {array.dtype.str} {array.shape}".encode())
+        result.update(array.tobytes())
     return result.hexdigest()
 
 
@@ -213,7 +213,7 @@ def _difference(theirs: Any, ours: Any, key: str = "") -> str:
         return ""
     if theirs == ours:
         return ""
-    if all(isinstance(one, str) and one.startswith(DIGEST) for one in (theirs, ours)):
+    if all(isinstance(item, str) and item.startswith(DIGEST) for item in (theirs, ours)):
         return f"the content of the file {key} has changed"
     return f"{key} = {theirs!r} there, {ours!r} here"
 

@@ -260,7 +260,7 @@ def by_law_name(scene: Scene, values: np.ndarray) -> dict[str, np.ndarray]:
     """Return values (n,) of the law's variables under their names in files."""
     count = len(scene.motion.coefficients)
     result = {"motion/shape": values[:count], "motion/duration": values[count:]}
-    return {name: one for name, one in result.items() if len(one)}
+    return {name: item for name, item in result.items() if len(item)}
 
 
 def under_law_of(scene: Scene, design: Path | None) -> Scene:
@@ -268,8 +268,8 @@ def under_law_of(scene: Scene, design: Path | None) -> Scene:
     if design is None or not law_names(scene):
         return scene
     arrays, here = _load_design(design), by_law_name(scene, law_values(scene))
-    values = [np.ravel(arrays.get(name, one)) for name, one in here.items()]
-    if [len(value) for value in values] != [len(one) for one in here.values()]:
+    values = [np.ravel(arrays.get(name, item)) for name, item in here.items()]
+    if [len(value) for value in values] != [len(item) for item in here.values()]:
         raise InputError(
             f"{design}: motion/shape: {len(values[0])} coefficients, and motion.shape has "
             f"{len(scene.motion.coefficients)} in {scene.source}; state as many"
@@ -385,10 +385,10 @@ def _fit(
     keys = (f"{name}/centroid", f"{name}/density")
     missing = [key for key in keys if key not in arrays]
     if missing:
-        found = sorted({key.split("/")[0] for key in arrays if "/" in key})
+        result = sorted({key.split("/")[0] for key in arrays if "/" in key})
         raise InputError(
             f"{path}: missing key {missing[0]!r} for arm {name!r}; the file holds "
-            f"{', '.join(map(repr, found)) or 'nothing'}; give a design made for these arms"
+            f"{', '.join(map(repr, result)) or 'nothing'}; give a design made for these arms"
         )
     centroid, density = (np.asarray(arrays[key]) for key in keys)
     if centroid.ndim != 2 or centroid.shape[1] < mesh.dim or density.shape != centroid.shape[:1]:

@@ -116,12 +116,12 @@ def check_unused(folder: Path, names: Collection[str] = RUN_FILES, *, resume: st
         names: what the command would write.
         resume: file with which the command's option --resume goes on; "" where there is none.
     """
-    found = [name for name in names if (folder / name).exists()]
-    if found:
-        more = f" and {len(found) - 1} more files" if len(found) > 1 else ""
+    result = [name for name in names if (folder / name).exists()]
+    if result:
+        more = f" and {len(result) - 1} more files" if len(result) > 1 else ""
         others = "--resume to go on, " if resume and (folder / resume).exists() else ""
         raise InputError(
-            f"{folder}: holds results already ({found[0]}{more}); {others}--overwrite to replace "
+            f"{folder}: holds results already ({result[0]}{more}); {others}--overwrite to replace "
             "them, or another --out"
         )
 

@@ -211,12 +211,12 @@ def _gather_traits(run: RankResult) -> dict[int, _Traits]:
     with together(partition.world):
         return {
             k: replace(
-                one,
+                item,
                 widths=widths.get(k, (None, None)),
                 frequency=frequencies.get(k, (None, None))[0],
                 error=frequencies.get(k, (None, None))[1],
             )
-            for k, one in every.items()
+            for k, item in every.items()
         }
 
 
@@ -232,15 +232,15 @@ def _of_designs(run: RankResult, traits: Mapping[int, _Traits]) -> dict[str, Any
     loaded = zip(flexible, run.evaluation.values_of("eigenfrequency"), strict=False)
     return {
         "grayness": _grayness(traits),
-        "volume_fraction": {name: one.volume_fraction for name, one in by_arm.items()},
+        "volume_fraction": {name: item.volume_fraction for name, item in by_arm.items()},
         "connected": max((trait.contacts.pieces for trait in traits.values()), default=0),
-        "contacts": {name: _contacts(one.contacts) for name, one in by_arm.items()},
-        "minimum_member_measured": {name: _size(one.widths[0]) for name, one in by_arm.items()},
-        "minimum_gap_measured": {name: _size(one.widths[1]) for name, one in by_arm.items()},
-        "too_narrow": [asdict(one) for one in _too_narrow(run, traits)],
+        "contacts": {name: _contacts(item.contacts) for name, item in by_arm.items()},
+        "minimum_member_measured": {name: _size(item.widths[0]) for name, item in by_arm.items()},
+        "minimum_gap_measured": {name: _size(item.widths[1]) for name, item in by_arm.items()},
+        "too_narrow": [asdict(item) for item in _too_narrow(run, traits)],
         "first_frequency": _first_frequencies(run, by_arm),
         "first_frequency_error": {
-            name: one.error for name, one in by_arm.items() if one.error is not None
+            name: item.error for name, item in by_arm.items() if item.error is not None
         },
         "loaded_frequency": dict(loaded),
     }
@@ -365,7 +365,7 @@ def _all_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
         *motion_warnings(run),
         *_unstiffened(stiffening_of(run.arms)),
         *([] if is_grey(run.scene, _grayness(traits)) else _contact_warnings(run, traits)),
-        *(one.sentence for one in _too_narrow(run, traits)),
+        *(item.sentence for item in _too_narrow(run, traits)),
     ]
 
 
@@ -541,7 +541,7 @@ def _widths(
                 points = _lowest(mesh.comm, points)
             corners[k], solid[k], fixed[k] = points, x_phys[k] > SOLID, mesh.fixed
             asked[k] = max(design.least_widths)
-    whole, cut, stays = (gather_cells(partition, one) for one in (corners, solid, fixed))
+    whole, cut, stays = (gather_cells(partition, item) for item in (corners, solid, fixed))
     asked = gather_arms(partition, asked)
     with together(partition.world):
         return {k: widths_of(whole[k], cut[k], stays[k], asked[k]) for k in whole}
@@ -606,14 +606,14 @@ def _against_contacts(scene: Scene, index: int, size: float) -> str:
     """Return what keeps contacts out of the next design of an arm."""
     design, radius = scene.design, scene.filter_radius(index)
     least = FILTER_CELLS * size
-    found = [] if design.projection == "robust" else ['design.projection = "robust"']
-    if found or design.erosion < EROSION:
-        found.append(f"design.erosion = {EROSION:g}")
-    if radius < least * (1.0 - 1e-9) or not found:
+    result = [] if design.projection == "robust" else ['design.projection = "robust"']
+    if result or design.erosion < EROSION:
+        result.append(f"design.erosion = {EROSION:g}")
+    if radius < least * (1.0 - 1e-9) or not result:
         wider = max(least, radius + 0.5 * size)
         key = "a larger design.minimum_member"
-        found.append(key if design.controls_widths else f"design.filter_radius = {wider:.4g}")
-    *rest, last = found
+        result.append(key if design.controls_widths else f"design.filter_radius = {wider:.4g}")
+    *rest, last = result
     return f"set {', '.join(rest)}{' and ' if rest else ''}{last}, or use finer cells"
 
 
@@ -711,8 +711,8 @@ def _figures(evaluation: Motion) -> dict[str, float]:
 def _slowest(world: MPI.Comm, seconds: Mapping[str, float]) -> dict[str, float]:
     """Return the largest time of any rank by phase."""
     slowest: dict[str, float] = {}
-    for one in world.allgather(dict(seconds)):
-        for phase, value in one.items():
+    for item in world.allgather(dict(seconds)):
+        for phase, value in item.items():
             slowest[phase] = max(slowest.get(phase, 0.0), value)
     return slowest
 
@@ -758,7 +758,7 @@ def write_budget(folder: Path, budget: Mapping[str, Any] | None) -> None:
     if budget is None:
         return
     rows = [
-        f"{one['kind']},{one['name']},{one['deflection']:.10g},{one['share']:.10g}\n"
-        for one in budget["parts"]
+        f"{item['kind']},{item['name']},{item['deflection']:.10g},{item['share']:.10g}\n"
+        for item in budget["parts"]
     ]
     write_text(folder / "budget.csv", "".join(["kind,part,deflection [m],share [-]\n", *rows]))

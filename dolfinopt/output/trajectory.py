@@ -115,7 +115,7 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
         return scene.driven
     pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
     names = list(scene.rigid_units)
-    soft = {names[k] for k, one in pairs if k is not None and one.stiffness > 0.0}
+    soft = {names[k] for k, item in pairs if k is not None and item.stiffness > 0.0}
     soft |= {rod.name for rod in scene.rods if rod.is_spring}
     return tuple(name for name in scene.driven if name in soft)
 

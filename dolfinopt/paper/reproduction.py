@@ -44,7 +44,7 @@ DYNAMIC = ("esl", "gradient=esl", "worst=compliance")
 FORCE_ALONE = ("static compliance, force alone", ("static", "loads=[[0, 1, 0]]"))
 CUT_OFF = "attached=none"  # no mass at the ends: the optimiser would cut the arms off
 # Objectives: label, kind, and the settings that make it.
-VARIANTS = (*(one for one in variants.OBJECTIVES if CUT_OFF not in one[1]), FORCE_ALONE)
+VARIANTS = (*(item for item in variants.OBJECTIVES if CUT_OFF not in item[1]), FORCE_ALONE)
 STATIC = [label for label, (kind, *_) in VARIANTS if kind in ("static", "eigenfrequency")]
 SHOWN = [VARIANTS[0][0], *STATIC]  # in figure 3
 SWEEPS = {  # table: key, axis, what a value is called
@@ -161,14 +161,14 @@ def reproduce(plan: Plan, folder: Path, world: MPI.Comm) -> tuple[pd.DataFrame, 
 
 def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
     """Return the table with what came out of its cases, see the module."""
-    found, made = ([outcomes[case] for case in table[name]] for name in ("case", "made"))
+    result, made = ([outcomes[case] for case in table[name]] for name in ("case", "made"))
     results = table.assign(
-        compliance=[one.compliance for one in found],
-        deviation=[one.max_deviation for one in found],
-        grayness=[one.grayness for one in found],
-        iterations=[one.iterations for one in made],
-        note=[one.failure or one.stop_reason for one in found],
-        own=[one.compliance for one in made],
+        compliance=[item.compliance for item in result],
+        deviation=[item.max_deviation for item in result],
+        grayness=[item.grayness for item in result],
+        iterations=[item.iterations for item in made],
+        note=[item.failure or item.stop_reason for item in result],
+        own=[item.compliance for item in made],
         apart=math.nan,
     )
     apart = {"coordinates": ("label", _deviations_apart), "reductions": ("table", _cells_apart)}
@@ -181,16 +181,16 @@ def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
     return results
 
 
-def _cells_apart(one: Outcome, other: Outcome) -> float:
+def _cells_apart(outcome: Outcome, other: Outcome) -> float:
     """Return the part of the cells on the other side of one half; both have the same cells."""
-    with np.load(one.design) as a, np.load(other.design) as b:
+    with np.load(outcome.design) as a, np.load(other.design) as b:
         keys = [key for key in a.files if key.endswith("/density")]
         return float(np.mean([((a[key] > 0.5) != (b[key] > 0.5)).mean() for key in keys]))
 
 
-def _deviations_apart(one: Outcome, other: Outcome) -> float:
+def _deviations_apart(outcome: Outcome, other: Outcome) -> float:
     """Return how far two deviations are apart at most, relative to the other's largest."""
-    a, b = one.deviation()[1], other.deviation()[1]
+    a, b = outcome.deviation()[1], other.deviation()[1]
     return float(np.abs(a - b).max() / b.max())
 
 
@@ -220,14 +220,14 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
         return [outcome for case in cases if not (outcome := outcomes[case]).failure]
 
     optimum = coordinates[coordinates.label == OPTIMUM].groupby("kind", sort=False)
-    ends = dict.fromkeys(case for _, one in optimum for case in one.case.iloc[[0, -1]])
+    ends = dict.fromkeys(case for _, item in optimum for case in item.case.iloc[[0, -1]])
     again = [replace(outcomes[c], case=made) for c, made in zip(reductions.case, reductions.made)]
     shown = [good(objectives.case[objectives.label.isin(n)]) for n in ((INITIAL, SHOWN[0]), SHOWN)]
     with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
     axes = "elastic coordinates of each arm [-]", QUANTITIES[0]
     by_count = tuple(
-        Panel(label, *axes, studies.lines_by(one, "kind", "x", axes[1]), x_log2=True)
-        for label, one in coordinates.astype({"x": int}).groupby("label", sort=False)
+        Panel(label, *axes, studies.lines_by(item, "kind", "x", axes[1]), x_log2=True)
+        for label, item in coordinates.astype({"x": int}).groupby("label", sort=False)
     )
     lines = [
         _over_time("Deviation of the end-effector by objective", *shown),
@@ -264,9 +264,9 @@ def _convergence(found: Sequence[Outcome]) -> Iterator[LineFigure]:
         ("grayness", "grayness", "grayness [-]"),
     ):
         lines = []
-        for one in found:
-            x, y = zip(*((row.iteration, getattr(row, key)) for row in one.history()))
-            lines.append(Line(one.case.label, np.array(x), np.array(y)))
+        for item in found:
+            x, y = zip(*((row.iteration, getattr(row, key)) for row in item.history()))
+            lines.append(Line(item.case.label, np.array(x), np.array(y)))
         seen = key == "objective"
         title = "as the own model sees it" * seen
         panel = Panel(title, "iteration [-]", label, tuple(lines), y_log=seen or None)
@@ -295,10 +295,10 @@ def write_report(
         return
     from dolfinopt.study.figures import draw_all
 
-    files = draw_all({name: one for name, (one, _) in figures.items()}, folder)
+    files = draw_all({name: item for name, (item, _) in figures.items()}, folder)
     pictures = [
-        (int(name[3:]), one.title, embedded(file.read_bytes()))
-        for (name, (one, _)), file in zip(figures.items(), files, strict=True)
+        (int(name[3:]), item.title, embedded(file.read_bytes()))
+        for (name, (item, _)), file in zip(figures.items(), files, strict=True)
     ]
     tables = [data for _, data in figures.values() if isinstance(data, Table)]
     differing = variants.differences(load_paper(), plan.scene).items()
@@ -353,10 +353,10 @@ def check_paper(results: pd.DataFrame) -> list[Check]:
         return bool(environment.compile_expression(text, False)(values))
 
     checks = []
-    for one in TABLE["statement"]:
-        texts = {k: environment.from_string(one.get(k, "")).render(values).strip() for k in TEXTS}
-        holds, stands = verdict(one["holds"]), verdict(one.get("stands", "true"))
-        checks.append(Check(**texts, holds=holds, stands=stands, figures=tuple(one["figures"])))
+    for item in TABLE["statement"]:
+        texts = {k: environment.from_string(item.get(k, "")).render(values).strip() for k in TEXTS}
+        holds, stands = verdict(item["holds"]), verdict(item.get("stands", "true"))
+        checks.append(Check(**texts, holds=holds, stands=stands, figures=tuple(item["figures"])))
     return checks
 
 
@@ -441,7 +441,7 @@ def _of_payloads(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _of_paths(rows: pd.DataFrame) -> dict[str, Any]:
-    designs = {label: one.set_index("x") for label, one in rows.groupby("label")}
+    designs = {label: item.set_index("x") for label, item in rows.groupby("label")}
     initial, solid = designs[INITIAL], designs[SOLID].deviation
     nominal = rows.dropna(subset="made_for").label.iloc[-1]
     made = cross_values(rows, "deviation")

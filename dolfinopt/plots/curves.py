@@ -126,13 +126,13 @@ def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
     alone is limited.
     """
     limits = limits_by_column(scene, rows[0].constraints)
-    if all(one.response.declared.of_nominal for one in constraints_of(scene)):
+    if all(item.response.declared.of_nominal for item in constraints_of(scene)):
         return None
     figure, grid = panel_grid(np.ones((2, 1), dtype=bool), "Limits of the design", "iteration")
     above, below = grid[:, 0]
     iteration = [row.iteration for row in rows]
     objective = np.array([abs(row.objective) or 1.0 for row in rows])
-    lower = {one.name for one in constraints_of(scene) if one.response.declared.lower}
+    lower = {item.name for item in constraints_of(scene) if item.response.declared.lower}
     every = []
     for number, (name, limit) in enumerate(limits.items()):
         value = np.array([row.constraints[name] for row in rows])
@@ -418,8 +418,8 @@ def law_figure(scene: Scene) -> Figure:
     for k, (axes, word) in enumerate(
         zip(grid[:, 0], ("way", "speed", "acceleration"), strict=True)
     ):
-        for (name, one), colour in zip(values.items(), (BLUE, ORANGE), strict=False):
-            axes.plot(t, length * one[k], color=colour, label=name)
+        for (name, value), colour in zip(values.items(), (BLUE, ORANGE), strict=False):
+            axes.plot(t, length * value[k], color=colour, label=name)
         axes.set_xlim(t[0], t[-1])
         largest = length * np.abs(values["designed"][k]).max()
         _head(axes, f"{word} [{units[k]}]", f"largest {largest:.3g}")
@@ -446,9 +446,9 @@ def constraint_label(name: str) -> str:
 def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
     """Return the limit of every column of history.csv that is a constraint's."""
     result: dict[str, float] = {}
-    for one in constraints_of(scene):
-        own = [c for c in columns if c == one.name or c.startswith(f"{one.name}_")]
-        limits = [float(limit) for limit in np.broadcast_to(one.limit, len(own))]
+    for item in constraints_of(scene):
+        own = [c for c in columns if c == item.name or c.startswith(f"{item.name}_")]
+        limits = [float(limit) for limit in np.broadcast_to(item.limit, len(own))]
         result.update(zip(own, limits, strict=True))
     return result
 

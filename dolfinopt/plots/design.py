@@ -86,7 +86,7 @@ def _densities_figure(views: Sequence[ArmView], title: str) -> Figure:
         if view.length is not None:
             axes.plot([0.0, view.length], [0.0, 0.0], "o", mfc="white", mec="black", clip_on=False)
         axes.set_title(_caption(view))
-    keys = {key: one for axes in rows for one, key in zip(*axes.get_legend_handles_labels())}
+    keys = {key: item for axes in rows for item, key in zip(*axes.get_legend_handles_labels())}
     if keys:
         figure.legend(list(keys.values()), list(keys), loc="lower left")
     colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))

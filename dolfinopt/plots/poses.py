@@ -131,7 +131,7 @@ def body_poses(
         over_time([posed.body(i)[1] for i in bodies], (d,)),
         over_time([*(posed.body(i)[2] for i in bodies), end_rotation], (d, d)),
         over_time([posed.interface(i, 0)[0] for i in bodies], (d,)),
-        over_time([posed.interface(one.parent, one.interface)[0] for one in hung], (d,)),
+        over_time([posed.interface(item.parent, item.interface)[0] for item in hung], (d,)),
         end.T,
         loops.at(linear, q_r, q_e).places if loops.ties else np.zeros((len(q_r), 0, 2, d)),
     )

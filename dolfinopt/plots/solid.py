@@ -191,7 +191,7 @@ def solid_parts_figure(
         title: above the picture.
         masses: of the parts, kg.
     """
-    boxes = [(one.surface.points.min(axis=0), one.surface.points.max(axis=0)) for one in parts]
+    boxes = [(item.surface.points.min(axis=0), item.surface.points.max(axis=0)) for item in parts]
     figure, panels = box_rows(boxes, title)
     for part, box, axes, mass in zip(parts, boxes, panels, masses, strict=True):
         _draw_boxed(axes, box, part.surface, edges=False, color=STEEL)

@@ -66,8 +66,8 @@ def read_table(
         if wrong := wrong if name in (TIME, *columns) else "unknown":
             raise InputError(f"{file}: line {number}: {wrong} column {name!r}; {allowed}")
     if len(lines) < 3:
-        found = len(lines) - 1
-        raise InputError(f"{file}: {found} row(s) below the column names; expected at least 2")
+        result = len(lines) - 1
+        raise InputError(f"{file}: {result} row(s) below the column names; expected at least 2")
     numbers = tuple(k for k, _ in lines[1:])
     every = lines[0][1]
     values = np.array([_row(f"{file}: line {k}", every, cells) for k, cells in lines[1:]])[:, kept]
@@ -104,7 +104,7 @@ def _lines(file: str) -> list[tuple[int, list[str]]]:
     numbered = enumerate(text.splitlines(), start=1)
     lines = [(k, x) for k, x in numbered if x.strip() and not x.lstrip().startswith("#")]
     first = lines[0][1] if lines else ""
-    separator = next((one for one in (";", "\t") if one in first), ",")
+    separator = next((item for item in (";", "\t") if item in first), ",")
     return [(k, _cells(x, separator)) for k, x in lines]
 
 

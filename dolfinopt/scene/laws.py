@@ -78,11 +78,11 @@ class Law:
         v = np.where(late, 1.0 - u, u)
         k = np.searchsorted(self.starts[1:], v + np.where(late, SAME, -SAME))
         h = np.maximum(v - self.starts[k], 0.0)
-        found = (self.pieces[:, k] * np.vander(h, self.pieces.shape[2], increasing=True)).sum(
+        result = (self.pieces[:, k] * np.vander(h, self.pieces.shape[2], increasing=True)).sum(
             axis=2
         )
-        turned = u - 0.5 + found[0], 1.0 - found[1], found[2], -found[3]
-        values: np.ndarray = np.where(late, turned, found)
+        turned = u - 0.5 + result[0], 1.0 - result[1], result[2], -result[3]
+        values: np.ndarray = np.where(late, turned, result)
         return values
 
 
@@ -105,8 +105,8 @@ class ShapedLaw:
         u = t / duration
         moving = (u > 0.0) & (u < 1.0)  # at the ends it rests exactly
         s, sd, sdd = (
-            one + moving * self._change.deriv(k)(u) / duration**k
-            for k, one in enumerate(self.base(t, duration))
+            item + moving * self._change.deriv(k)(u) / duration**k
+            for k, item in enumerate(self.base(t, duration))
         )
         return s, sd, sdd
 

@@ -566,16 +566,16 @@ def _measure_path(tree: dict[str, Any]) -> Keys:
     """Complete the lengths of path and filter from the arms'; return their (table, key)."""
     lengths, heights = (_sizes(rows(tree, "arms"), key) for key in ("length", "height"))
     motion, design = tree.get("motion"), tree.setdefault("design", {})
-    found: dict[tuple[str, str], float] = {}
+    result: dict[tuple[str, str], float] = {}
     if motion and lengths and not tree.get("joints"):
-        found["motion", "joint_height"] = SHOULDER * sum(lengths)
+        result["motion", "joint_height"] = SHOULDER * sum(lengths)
         if motion.get("path") == "arc":
-            found["motion", "radius"] = ARC * sum(lengths)
+            result["motion", "radius"] = ARC * sum(lengths)
     if heights and not (design.get("minimum_member") or design.get("minimum_gap")):
-        found["design", "filter_radius"] = FILTERED * min(heights)
-    derived = [key for key in found if key[1] not in tree[key[0]]]
+        result["design", "filter_radius"] = FILTERED * min(heights)
+    derived = [key for key in result if key[1] not in tree[key[0]]]
     for table, key in derived:
-        tree[table][key] = found[table, key]
+        tree[table][key] = result[table, key]
     return tuple(derived)
 
 

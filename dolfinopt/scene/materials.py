@@ -118,7 +118,7 @@ def unknown_material(name: str) -> str:
     wanted = name.casefold()
     parts = [known for key, known in lower.items() if wanted and wanted in key]
     near = parts or [lower[key] for key in difflib.get_close_matches(wanted, lower, 2, 0.5)]
-    quoted = " or ".join(f'"{one}"' for one in near[:4])
+    quoted = " or ".join(f'"{item}"' for item in near[:4])
     hint = f"did you mean {quoted}? " if near else ""
     return (
         f"expected a material of the catalogue; {hint}"

@@ -62,7 +62,7 @@ def first_problem(
     problems = [_problem(dict(item), tree) for item in error.errors(include_url=False)]
     # Wrong elements of one array are one problem, and so are the kinds of value that a key takes.
     places = [(problem.kind, problem.locs) for problem in problems]
-    problems = [one for i, one in enumerate(problems) if places[i] not in places[:i]]
+    problems = [entry for i, entry in enumerate(problems) if places[i] not in places[:i]]
     known = {(problem.kind, problem.locs) for problem in problems}
     problems = [problem for problem in problems if not _is_echo(problem, tree, inherited, known)]
     # A misspelt key is also a missing one: the spelling is the message that helps.
@@ -323,7 +323,7 @@ def _describe(model: type[Table], prefix: str) -> Iterator[KeyInfo]:
         elif not is_explained_elsewhere(path):
             default = "" if field.is_required() else shown(field.default)
             default = "none" if default == "None" else default
-            also = tuple(one for one in ("arms", "joints") if _explains(path, f"{one}.{key}"))
+            also = tuple(item for item in ("arms", "joints") if _explains(path, f"{item}.{key}"))
             told = allowed_words(field), default, str(field.description)
             yield KeyInfo(path, *told, also)
 
@@ -353,13 +353,13 @@ PHYSICAL = (("motion", "gravity"), ("damping", "stiffness_proportional"), ("moti
 def assumed(scene: Scene) -> str:
     """Return in one line what is not stated: lengths by the arms, times, gravity, damping."""
     physical = [loc for loc in PHYSICAL if loc[1] not in getattr(scene, loc[0]).model_fields_set]
-    found = [_with_value(scene, loc) for loc in dict.fromkeys((*scene.derived, *physical))]
+    result = [_with_value(scene, loc) for loc in dict.fromkeys((*scene.derived, *physical))]
     ends = {
         f"arms.{arm.name}.passive = {arm.solid_ends:.4g} m"
         for arm in scene.arms
         if arm.designed and arm.passive is None and arm.solid_ends > 0.0
     }
-    told = [one for one in (*found, *sorted(ends)) if one]
+    told = [item for item in (*result, *sorted(ends)) if item]
     return f"assumed: {', '.join(told)}" if told else ""
 
 
@@ -420,9 +420,9 @@ def _materials(scene: Scene) -> list[str]:
             value = getattr(solid, key)
             where = f"arms.{arm.name}" if getattr(arm, key) is not None else "material"
             values = value if isinstance(value, tuple) else (value,)
-            for one in (one for one in values if not low <= one <= high):
+            for item in (entry for entry in values if not low <= entry <= high):
                 sentences[
-                    f"{where}.{key} = {one:g} {unit} is outside the range of structural "
+                    f"{where}.{key} = {item:g} {unit} is outside the range of structural "
                     f"materials, {low:g} to {high:g} {unit}; check the unit"
                 ] = None
     return list(sentences)

@@ -55,7 +55,7 @@ def _scaled(key: str) -> Callable[[Tree, Row, Any], None]:
 def scaled(value: Any, factor: Any) -> Any:
     """Return a number, or an array of them, times a factor; what is neither as it is."""
     if isinstance(value, list | tuple):
-        return [scaled(one, factor) for one in value]
+        return [scaled(item, factor) for item in value]
     numbers = (int, float)
     is_number = isinstance(value, numbers) and isinstance(factor, numbers)
     return float(value) * factor if is_number and not isinstance(value, bool) else value
@@ -67,7 +67,7 @@ def _of_site(key: str) -> Callable[[Tree, Row, Any], None]:
     def translate(tree: Tree, row: Row, value: Any) -> None:
         arm = row.get(key)
         if arm is None:
-            arm = next((one.get("name") for one in reversed(rows(tree, "arms"))), "")
+            arm = next((item.get("name") for item in reversed(rows(tree, "arms"))), "")
         row[key] = site_of(str(arm))[0]
         if str(value).casefold() != OUTBOARD:
             row[key] += f".{value}"
@@ -145,9 +145,9 @@ def in_new_words(key: str) -> str:
     if "." not in key:
         return key
     table, *which, name = key.split(".")
-    word = next((one for one in OLD_WORDS if one.old == f"{table}.{name}"), None)
-    if word is not None and (found := re.fullmatch(r"[a-z]+\.([a-z_]+)( times it)?", word.new)):
-        name = found[1] + ("*" if found[2] else "")
+    word = next((item for item in OLD_WORDS if item.old == f"{table}.{name}"), None)
+    if word is not None and (result := re.fullmatch(r"[a-z]+\.([a-z_]+)( times it)?", word.new)):
+        name = result[1] + ("*" if result[2] else "")
     return ".".join([table, *which, name])
 
 

@@ -76,24 +76,24 @@ def region_problem(arm: Arm, cells: Cells) -> tuple[int, str] | None:
     Every region covers a cell, none is solid and void at once, and the arm does not fall apart:
     both interfaces are joined by cells that may be solid, and so is every cell that must be.
     """
-    found = region_cells(arm, cells.centroid)
-    for number, inside in enumerate(found.each):
+    result = region_cells(arm, cells.centroid)
+    for number, inside in enumerate(result.each):
         if not inside.any():
             return number, (
                 "expected a place in the arm and the size of a cell at least: it covers the "
                 "centroid of no cell"
             )
-    solid = cells.passive | found.solid
-    for number, inside in enumerate(found.each):
+    solid = cells.passive | result.solid
+    for number, inside in enumerate(result.each):
         if arm.regions[number].kind == "void" and (both := int((inside & solid).sum())):
             ends = "in the solid ends or " if (inside & cells.passive).any() else "in "
             return number, (
                 f"expected no cell that is kept solid: {both} of its cells are {ends}"
                 "a solid region, too; move it, or shorten arms.passive"
             )
-    if not found.void.any():
+    if not result.void.any():
         return None
-    broken = _falls_apart(cells, solid, found.void)
+    broken = _falls_apart(cells, solid, result.void)
     if broken is None:
         return None
     last = max(n for n, region in enumerate(arm.regions) if region.kind == "void")

@@ -189,9 +189,9 @@ class Scene(Table):
         """
         if not self.design.controls_widths:
             return 1.0
-        one = self.arms[index]
+        arm = self.arms[index]
         repeated = [self.arms[i] for i, pattern in self.patterns.items() if pattern == index]
-        scales = [s for a in repeated for s in (a.length / one.length, a.height / one.height)]
+        scales = [s for a in repeated for s in (a.length / arm.length, a.height / arm.height)]
         return min([1.0, *scales])
 
     @property

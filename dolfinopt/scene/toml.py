@@ -25,8 +25,8 @@ def toml_value(value: Any) -> str:
     if isinstance(value, (str, os.PathLike)):
         return json.dumps(os.fspath(value), ensure_ascii=False)
     if isinstance(value, Mapping):
-        pairs = (f"{key} = {toml_value(one)}" for key, one in value.items() if one is not None)
+        pairs = (f"{key} = {toml_value(item)}" for key, item in value.items() if item is not None)
         return f"{{ {', '.join(pairs)} }}"
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(toml_value(one) for one in value if one is not None)}]"
+        return f"[{', '.join(toml_value(item) for item in value if item is not None)}]"
     raise TypeError(f"{type(value).__name__}: no value of a scene")

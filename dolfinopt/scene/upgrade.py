@@ -107,7 +107,7 @@ def _edited(
             mine, fresh = fresh[:1], fresh[1:]
         edits |= {k: [] for k in range(first, last + 1)}
         note = _comment(lines[last]) if key in block.keys else ""
-        edits[first] = [f"{one}{note}" for one in mine]
+        edits[first] = [f"{item}{note}" for item in mine]
     if fresh:
         edits[block.first] = [lines[block.first], *fresh]
     return edits

@@ -60,7 +60,7 @@ def before_after(before: Summary, after: Summary) -> Table:
     InputError where they have other arms or drives.
     """
     for key, what in (("mass", "arms"), ("drive_peak", "drives")):
-        names = [", ".join(one.get(key) or {}) for one in (before, after)]
+        names = [", ".join(item.get(key) or {}) for item in (before, after)]
         if names[0] != names[1]:
             raise InputError(
                 f"the runs have other {what}: {names[0] or 'none'} before, "
@@ -176,9 +176,9 @@ def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
     """Yield every link that one of the runs designs, by its name: both to one scale."""
     from dolfinopt.plots.design import design_figure
 
-    found = [(label, view) for label, side in sides.items() for view in designed(side.views)]
-    for name in dict.fromkeys(view.name for _, view in found):
-        views = [replace(view, name=label) for label, view in found if view.name == name]
+    result = [(label, view) for label, side in sides.items() for view in designed(side.views)]
+    for name in dict.fromkeys(view.name for _, view in result):
+        views = [replace(view, name=label) for label, view in result if view.name == name]
         masses = {view.name: sides[view.name].summary["mass"][name] for view in views}
         yield name, _embedded(design_figure(views, name, masses))
 

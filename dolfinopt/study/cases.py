@@ -247,12 +247,12 @@ def simulate_scenarios(
         place = scene, partition, arms, x_phys
         try:
             choice = choose_coordinates(*place, profile)
-            found: RankResult | ConvergenceError = simulation_result(
+            result: RankResult | ConvergenceError = simulation_result(
                 *place, *evaluate(*place, profile), profile, choice
             )
         except ConvergenceError as error:
-            found = error
-        yield found
+            result = error
+        yield result
         profile.seconds.clear()  # the account of the next scene; the arms know the profile
         profile.counts = Counts()
 
@@ -290,8 +290,8 @@ def simulate_samples(
         yield from [nominal] * len(scenes)
     elif nominal is None:
         for scene in scenes:
-            (found,) = simulate_scenarios([scene], design)
-            yield found if isinstance(found, ConvergenceError) else _trajectory(found)
+            (result,) = simulate_scenarios([scene], design)
+            yield result if isinstance(result, ConvergenceError) else _trajectory(result)
     else:
         start = _trajectory(nominal)
         owned = {k: start.mechanism.bodies[k] for k in nominal.arms}
@@ -386,8 +386,8 @@ def run_cases(
     where a scene or design cannot be used, the others stay unfinished; another run works in the
     folder DIR, or it cannot be written.
     """
-    both = (one for case in cases for one in (case.design, case))
-    wanted = list(dict.fromkeys(one for one in both if isinstance(one, Case)))
+    both = (item for case in cases for item in (case.design, case))
+    wanted = list(dict.fromkeys(item for item in both if isinstance(item, Case)))
     with working_alone(world, folder):
         work = folder / (WORK + on_root(world, lambda: uuid4().hex))
         place = _Place(folder / CASES, work, keep)
@@ -543,8 +543,8 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
         if scaled and nominal is None:
             (nominal,) = simulate_scenarios([scene], design)
         rows, messages = [], {}
-        found = simulate_samples(nominal if scaled else None, scenes, design)
-        for number, trajectory in enumerate(found, case.first):
+        result = simulate_samples(nominal if scaled else None, scenes, design)
+        for number, trajectory in enumerate(result, case.first):
             if isinstance(trajectory, ConvergenceError):
                 messages[number] = str(trajectory)
                 rows.append((math.nan,) * len(SAMPLED))

@@ -75,11 +75,11 @@ def study_motions(scene: Scene, designs: Sequence[Path], runner: Runner) -> Stud
     files = [design]
     if isinstance(design, Case):
         searched = [design, Case(with_kind(scene, "tip"), "optimize", label=DESIGNED)]
-        found = runner.run(searched)
-        if found.failures:
-            failed = tuple(text for failure in found.failures for text in failure.failures)
+        result = runner.run(searched)
+        if result.failures:
+            failed = tuple(text for failure in result.failures for text in failure.failures)
             return Study(NAME, (), (), failed, runner.computed)
-        files = [found[one].design for one in searched]
+        files = [result[item].design for item in searched]
     motions = on_root(runner.world, _motions, scene, files, runner.folder / NAME)
     done = runner.run(motion.case for motion in motions)
     rows = [(motion, done[motion.case]) for motion in motions]
@@ -211,7 +211,7 @@ def _verdict(able: Sequence[Outcome]) -> str:
     """Return how far the tip is off with the first motion and with the best."""
     if not able:
         return "No motion can be simulated."
-    first, best = able[0], min(able, key=lambda one: one.max_deviation)
+    first, best = able[0], min(able, key=lambda item: item.max_deviation)
     return (
         f"With {first.case.label} the tip is off by {1e3 * first.max_deviation:.4g} mm, with "
         f"{best.case.label} by {1e3 * best.max_deviation:.4g} mm."
@@ -229,8 +229,8 @@ def _cells(scene: Scene, motion: Motion, outcome: Outcome) -> dict[str, Any]:
         "finer model [mm]": 1e3 * motion.finer,
         "settling [mm]": 1e3 * summary.get("settling", math.nan),
     }
-    for name, found in zip(machines(scene), summary.get("scenarios", ()), strict=False):
-        cells[f"{name} [mm]"] = 1e3 * found["max_deviation"]
+    for name, result in zip(machines(scene), summary.get("scenarios", ()), strict=False):
+        cells[f"{name} [mm]"] = 1e3 * result["max_deviation"]
     for name in scene.driven:
         unit = "N" if scene.rigid_units[name] == "m" else "N m"
         cells[f"peak {name} [{unit}]"] = summary.get("drive_peak", {}).get(name, math.nan)

@@ -125,23 +125,23 @@ def tabulated(rows: Iterable[tuple[Mapping[str, Any], Outcome]]) -> pd.DataFrame
     return pd.DataFrame({**labels, **results_of(outcome)} for labels, outcome in rows)
 
 
-def results_of(one: Outcome) -> dict[str, Any]:
+def results_of(outcome: Outcome) -> dict[str, Any]:
     """Return results by column, with units, and the outcome itself."""
-    summary = one.summary()
+    summary = outcome.summary()
     return {
-        "label": one.case.label,
-        COMPLIANCE: one.compliance,
-        DEVIATION: 1e3 * one.max_deviation,
-        "at [s]": one.max_deviation_time,
+        "label": outcome.case.label,
+        COMPLIANCE: outcome.compliance,
+        DEVIATION: 1e3 * outcome.max_deviation,
+        "at [s]": outcome.max_deviation_time,
         "settling [mm]": 1e3 * summary.get("settling", math.nan),
         "stress [MPa]": 1e-6 * (summary.get("stress") or {}).get("value", math.nan),
         "mass [kg]": summary.get("designed_mass", math.nan),
-        "grayness [-]": one.grayness,
-        "iterations": one.iterations,
-        "seconds": one.seconds,
-        "ended by": f"failed: {one.failure}" if one.failure else one.stopped,
-        "failure": one.failure,
-        "outcome": one,
+        "grayness [-]": outcome.grayness,
+        "iterations": outcome.iterations,
+        "seconds": outcome.seconds,
+        "ended by": f"failed: {outcome.failure}" if outcome.failure else outcome.stopped,
+        "failure": outcome.failure,
+        "outcome": outcome,
     }
 
 
@@ -162,7 +162,7 @@ def _plan(
 ) -> Plan:
     """Check what is asked and plan it (root only)."""
     asked = [parse_vary(text) for text in vary]
-    keys = [one.key for one in asked]
+    keys = [item.key for item in asked]
     if twice := [key for key in keys if keys.count(key) > 1]:
         raise InputError(f"--vary {twice[0]} twice; give all its values in one")
     if preset is None or preset in RANGES:
@@ -172,7 +172,7 @@ def _plan(
             raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
         return sweep_plan(scene, sweep_name(preset, vary), asked, designs, reoptimize)
     command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
-    if others := [one.text for one in asked if preset == "objective" or one.key != COORDINATES]:
+    if others := [item.text for item in asked if preset == "objective" or item.key != COORDINATES]:
         only = "none" if preset == "objective" else f"only {COORDINATES}"
         raise InputError(f"--vary {others[0]}: expected {only} with {command}")
     if preset != "coordinates" and designs:
@@ -240,7 +240,7 @@ def deviation_panels(found: Sequence[Outcome]) -> list[Panel]:
     """Return the deviation over time; designs of another magnitude get a panel of their own."""
     panels = []
     for group in magnitudes(found, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
-        curves = ((one.case.label, *one.deviation()) for one in group)
+        curves = ((item.case.label, *item.deviation()) for item in group)
         lines = tuple(Line(label, t, 1e3 * distance) for label, t, distance in curves)
         panels.append(Panel("", "time [s]", "deviation [mm]", lines))
     return panels
@@ -249,9 +249,9 @@ def deviation_panels(found: Sequence[Outcome]) -> list[Panel]:
 def design_figure(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
     """Return the designs beside one another, each with its results."""
     designs = []
-    for one in found:
-        figures = f"{one.compliance:.4g} N m, {1e3 * one.max_deviation:.4g} mm"
-        designs.append((f"{one.case.label}: {figures}", one.case.scene, one.design))
+    for item in found:
+        figures = f"{item.compliance:.4g} N m, {1e3 * item.max_deviation:.4g} mm"
+        designs.append((f"{item.case.label}: {figures}", item.case.scene, item.design))
     return DesignFigure(name, title, tuple(designs))
 
 
@@ -278,21 +278,21 @@ def sweep_plan(
 
     InputError where no given design fits the values, or they do nothing to it.
     """
-    for one in asked:
-        idle = one.key.partition(".")[0] in FOR_OPTIMISATION and one.key != "design.initial"
+    for item in asked:
+        idle = item.key.partition(".")[0] in FOR_OPTIMISATION and item.key != "design.initial"
         if idle and not reoptimize:
             raise InputError(
-                f"--vary {one.text}: does not change what a given design does; add "
+                f"--vary {item.text}: does not change what a given design does; add "
                 "--reoptimize to optimise one for every value"
             )
-    resized = [one.text for one in asked if re.search(RESIZING, one.key)]
+    resized = [entry.text for entry in asked if re.search(RESIZING, entry.key)]
     if resized and (designs or not reoptimize):
         remedy = "leave out --design" if reoptimize else "add --reoptimize to optimise one for each"
         raise InputError(
             f"--vary {resized[0]}: no given design fits arms of several sizes; {remedy}"
         )
     given = {"initial design": None} if resized else given_designs(scene, designs)
-    grids = [asked] if len(asked) <= 2 else [[one] for one in asked]
+    grids = [asked] if len(asked) <= 2 else [[entry] for entry in asked]
     rows = [row for keys in grids for row in _sweep(scene, keys, given, reoptimize, not resized)]
     if len(grids) == 1:
         return Plan(name, rows, partial(_sweep_report, keys=tuple(asked)))
@@ -447,13 +447,13 @@ def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
 
 def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     """Return true values in the motion, efforts by one set of weights, and all designs."""
-    found = [outcome.summary() for outcome in frame["outcome"]]
+    result = [outcome.summary() for outcome in frame["outcome"]]
     none = {"": math.nan}
-    forces = [np.array([*one.get("drive_rms", none).values()]) for one in found]
+    forces = [np.array([*item.get("drive_rms", none).values()]) for item in result]
     by = 1.0 if weights is None else np.array(weights)
     whole = frame.rename(columns={"label": "objective"}).assign(
         **{"effort [-]": [float(np.linalg.norm(force * by)) for force in forces]},
-        **{"mass [kg]": [sum(one.get("mass", none).values()) for one in found]},
+        **{"mass [kg]": [sum(item.get("mass", none).values()) for item in result]},
     )
     columns = ["objective", *QUANTITIES, "at [s]", "settling [mm]", "stress [MPa]", "effort [-]",
                "mass [kg]", "grayness [-]", "iterations", "seconds", "ended by"]  # fmt: skip
@@ -484,8 +484,8 @@ def _coordinates(frame: pd.DataFrame) -> Report:
     title = "Given designs against the number of elastic coordinates of each arm."
     x = "elastic coordinates of each arm [-]"
     panels = tuple(
-        Panel(str(label), x, y, lines_by(one, "method", "coordinates", y), x_log2=True)
-        for label, one in frame.groupby("design", sort=False)
+        Panel(str(label), x, y, lines_by(item, "method", "coordinates", y), x_log2=True)
+        for label, item in frame.groupby("design", sort=False)
         for y in QUANTITIES
     )
     table = Table("", title, by_design(frame, ["method", "coordinates"]))

@@ -264,7 +264,7 @@ def polynomial_indices(
     fits = []
     for degree in degrees:
         chosen = combinations_with_replacement(range(dimensions + 1), degree)  # the last is 1
-        rows = [tuple(np.bincount(one, minlength=dimensions + 1)[:-1]) for one in chosen]
+        rows = [tuple(np.bincount(item, minlength=dimensions + 1)[:-1]) for item in chosen]
         powers = np.array(sorted(rows, key=lambda row: (sum(row), row)))
         basis = np.prod([single[i][:, powers[:, i]] for i in range(dimensions)], axis=0)
         fits.append((degree, powers, *_fit(basis, spread)))
@@ -378,10 +378,10 @@ def _plan(
         raise InputError(f"--seed {seed}: expected an integer >= 0")
     nominal = changed(scene, "scenarios=[]") if scene.scenarios else scene
     inputs = [parse_input(nominal, text) for text in random]
-    keys = [one.key for one in inputs]
+    keys = [item.key for item in inputs]
     if twice := [key for key in keys if keys.count(key) > 1]:
         raise InputError(f"--random {twice[0]} twice; a value has one distribution")
-    values = draw([one.distribution for one in inputs], unit_points(count, len(inputs), seed))
+    values = draw([item.distribution for item in inputs], unit_points(count, len(inputs), seed))
     samples = sample_texts(keys, values)
     for index in (*values.argmin(axis=0), *values.argmax(axis=0)):  # refused, it is so there mostly
         with_sample(nominal, samples[1 + index], 1 + index)
@@ -466,7 +466,7 @@ def _range(field: FieldInfo) -> tuple[float, float]:
     if get_origin(kind) in (Union, UnionType):  # of arrays, too: the range of a number
         kind = get_args(kind)[0]
     inner = get_args(kind)[1:]
-    rules = [*field.metadata, *(rule for one in inner for rule in getattr(one, "metadata", ()))]
+    rules = [*field.metadata, *(rule for item in inner for rule in getattr(item, "metadata", ()))]
     lows, highs = (
         [getattr(rule, name) for rule in rules for name in names if hasattr(rule, name)]
         for names in (("gt", "ge"), ("lt", "le"))
@@ -482,7 +482,7 @@ def _report(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) ->
     tables = [_input_table(inputs)]
     if any(o.failure and not o.messages for o in frame["outcome"]):  # a design is missing
         return tables, []
-    samples, axes = _samples(frame, inputs, values), [one.axis for one in inputs]
+    samples, axes = _samples(frame, inputs, values), [item.axis for item in inputs]
     figures: list[Figure] = []
     if not (frame["failure"] != "").any():
         tables.append(_statistics_table(samples, len(values)))
@@ -497,24 +497,24 @@ def _report(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) ->
 
 def _samples(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -> pd.DataFrame:
     """Return a row a design and sample, number 0 with the nominal values: inputs and results."""
-    rows = np.vstack([[one.number for one in inputs], values])
-    known = pd.DataFrame(rows, columns=[one.axis for one in inputs])
+    rows = np.vstack([[item.number for item in inputs], values])
+    known = pd.DataFrame(rows, columns=[item.axis for item in inputs])
     known.insert(0, "sample", np.arange(len(known)))
     parts = []
     for design, own in frame.groupby("design", sort=False):
-        found = pd.concat([pd.DataFrame(o.samples) for o in own["outcome"]], ignore_index=True)
-        found = found.rename(columns=dict(zip(SAMPLED, RESULTS)))
-        found[QUANTITIES[1]] *= 1e3
-        parts.append(pd.concat([known.assign(design=design), found], axis=1))
+        result = pd.concat([pd.DataFrame(o.samples) for o in own["outcome"]], ignore_index=True)
+        result = result.rename(columns=dict(zip(SAMPLED, RESULTS)))
+        result[QUANTITIES[1]] *= 1e3
+        parts.append(pd.concat([known.assign(design=design), result], axis=1))
     return pd.concat(parts, ignore_index=True)
 
 
 def _input_table(inputs: Sequence[Input]) -> Table:
     rows = []
-    for one in inputs:
-        law = one.distribution
+    for item in inputs:
+        law = item.distribution
         cut = round(100.0 * law.cut_off, 6)
-        rows.append((one.axis, law.text, one.number, law.mean, law.deviation, cut))
+        rows.append((item.axis, law.text, item.number, law.mean, law.deviation, cut))
     columns = "input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]"
     title = "Random values, independent of one another, cut off where the key's range ends."
     return Table("inputs", title, pd.DataFrame(rows, columns=columns))
@@ -526,8 +526,8 @@ def _statistics_table(samples: pd.DataFrame, count: int) -> Table:
     for design, own in samples.groupby("design", sort=False):
         for what in QUANTITIES:
             values = own[what].to_numpy()
-            found = {"nominal": (values[0], math.nan, math.nan), **statistics(values[1:])}
-            rows += [(design, what, name, *one) for name, one in found.items()]
+            result = {"nominal": (values[0], math.nan, math.nan), **statistics(values[1:])}
+            rows += [(design, what, name, *item) for name, item in result.items()]
     frame = pd.DataFrame(rows, columns=["design", "quantity", "statistic", *ends])
     title = f"Designs under {count} samples, with {INTERVAL} as for independent samples."
     return Table("statistics", title, by_design(frame, ["quantity", "statistic"], ends))
@@ -535,14 +535,14 @@ def _statistics_table(samples: pd.DataFrame, count: int) -> Table:
 
 def _indices_table(samples: pd.DataFrame, inputs: Sequence[Input]) -> Table:
     """Return the Sobol' indices of all inputs, a row an input."""
-    rows, laws = [], [one.distribution for one in inputs]
+    rows, laws = [], [item.distribution for item in inputs]
     for design, own in samples[samples["sample"] > 0].groupby("design", sort=False):
-        points = own[[one.axis for one in inputs]].to_numpy()
+        points = own[[item.axis for item in inputs]].to_numpy()
         for what in QUANTITIES:
-            found = polynomial_indices(points, own[what].to_numpy(), laws)
+            result = polynomial_indices(points, own[what].to_numpy(), laws)
             rows += [
-                (design, what.partition(" [")[0], known.key, *first, *total, *found[2:])
-                for known, first, total in zip(inputs, found.first, found.total, strict=True)
+                (design, what.partition(" [")[0], known.key, *first, *total, *result[2:])
+                for known, first, total in zip(inputs, result.first, result.total, strict=True)
             ]
     columns = ("design", "quantity", "input", "first order [-]", "from", "to", "total [-]",
                "total from", "total to", "degree [-]", "unexplained [-]")  # fmt: skip

@@ -131,7 +131,7 @@ def asked_by(words: str) -> Iterator[None]:
 
 def differences(scene: Scene, other: Scene) -> dict[str, tuple[Any, Any]]:
     """Return by its key every value in which scenes differ, here and there; None: not set."""
-    here, there = (dict(_values(one.to_dict())) for one in (scene, other))
+    here, there = (dict(_values(item.to_dict())) for item in (scene, other))
     pairs = {key: (here.get(key), there.get(key)) for key in [*here, *there]}
     return {key: (a, b) for key, (a, b) in pairs.items() if a != b}
 
@@ -225,7 +225,7 @@ def reductions(scene: Scene, counts: Sequence[int] | None, usual: Sequence[int])
                     scenes.append(reduced(scene, method, count))
                 except InputError as error:
                     refusals.setdefault(count, error)
-    possible = {one.reduction.coordinates for one in scenes}
+    possible = {item.reduction.coordinates for item in scenes}
     for count in counts or ():
         if count not in possible:
             raise refusals[count]

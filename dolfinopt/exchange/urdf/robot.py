@@ -106,9 +106,9 @@ class Inertia:
         mass, centre, tensor = self.mass + other.mass, self.centre, np.zeros((3, 3))
         if mass != 0.0:
             centre = (self.mass * self.centre + other.mass * other.centre) / mass
-        for one in (self, other):
-            r = one.centre - centre
-            tensor += one.tensor + one.mass * (r @ r * np.eye(3) - np.outer(r, r))
+        for item in (self, other):
+            r = item.centre - centre
+            tensor += item.tensor + item.mass * (r @ r * np.eye(3) - np.outer(r, r))
         return Inertia(mass, centre, tensor)
 
 
@@ -304,20 +304,20 @@ def _next_joint(robot: Robot, name: str, tool: str) -> tuple[RobotJoint, np.ndar
     """Return the joint at a link's outboard end, and its pose in the link's frame."""
     # On the way to the tool if the link carries it; a joint that moves rather than a fixed one.
     onward = robot.path(tool)
-    found: list[tuple[int, RobotJoint, np.ndarray]] = []
+    result: list[tuple[int, RobotJoint, np.ndarray]] = []
     waiting = [(joint, joint.pose) for joint in robot.children(name)]
     while waiting:
         joint, pose = waiting.pop(0)
-        found.append((2 * (joint in onward) + joint.moves, joint, pose))
+        result.append((2 * (joint in onward) + joint.moves, joint, pose))
         if not joint.moves:
             waiting += [(other, pose @ other.pose) for other in robot.children(joint.child)]
-    if not found:
+    if not result:
         raise InputError(
             f"{robot.file}: link {name!r}: nothing hangs on it, so that its outboard end is not "
             "known; add a fixed joint there with a link for the tool"
         )
-    best = max(rank for rank, _, _ in found)
-    equal = [(joint, pose) for rank, joint, pose in found if rank == best]
+    best = max(rank for rank, _, _ in result)
+    equal = [(joint, pose) for rank, joint, pose in result if rank == best]
     return equal[0] if equal[0][0].moves else equal[-1]  # of fixed ones the tool's frame
 
 
@@ -338,8 +338,8 @@ def _interfaces(
 
 def _across(x: np.ndarray, *axes: np.ndarray) -> np.ndarray:
     """Return the direction across x that is nearest to the first axis with one, z or y."""
-    found = (axis - (axis @ x) * x for axis in (*axes, *np.eye(3)[:0:-1]))
-    across = next(one for one in found if np.linalg.norm(one) > 0.1)
+    result = (axis - (axis @ x) * x for axis in (*axes, *np.eye(3)[:0:-1]))
+    across = next(item for item in result if np.linalg.norm(item) > 0.1)
     return np.asarray(across / float(np.linalg.norm(across)))
 
 
@@ -440,12 +440,12 @@ def scene_bodies(
         own = (solid.length, solid.size, solid.measured) if solid else ()
         inertia = total.posed(inverse(frame))
         bodies.append(SceneBody(link, links, joint, parent, frame, pose, axis, inertia, *own))
-    if any(one.parent == tool for one in bodies):
+    if any(item.parent == tool for item in bodies):
         # A body without mass at the outboard interface of a tool on which others hang.
         name, still = f"{tool}_end", np.eye(4)
         joint = RobotJoint(name, "fixed", tool, name, still, still[0, :3])
         return (*bodies, SceneBody(name, (), joint, tool, still, still, joint.axis, MASSLESS))
-    return tuple(sorted(bodies, key=lambda one: one.link == tool))
+    return tuple(sorted(bodies, key=lambda item: item.link == tool))
 
 
 def _check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> None:
@@ -565,8 +565,8 @@ def read_loops(
     reader = _Reader(file, places, {body.link: body for body in bodies})
     closures, rods = [], []
     interfaces: dict[str, list[tuple[str, np.ndarray]]] = {}
-    for k, one in enumerate(data.get("closures", [])):
-        keys, site = reader.closure(f"closures.{k}", one)
+    for k, item in enumerate(data.get("closures", [])):
+        keys, site = reader.closure(f"closures.{k}", item)
         closures.append(keys)
         if site is not None:
             interfaces.setdefault(site[0], []).append((keys["name"], site[1]))

@@ -294,7 +294,7 @@ class RobotScene:
             t, rows: (n,) s, (n, joints) of all joints that move, then of driven rods.
         """
         new: dict[Path, str | bytes] = {
-            folder / self.mesh_name(one): one.mesh.data for one in self.bodies if one.mesh
+            folder / self.mesh_name(item): item.mesh.data for item in self.bodies if item.mesh
         }
         columns = [*(joint.name for joint in self.robot.movable), *self.loops.rods]
         kept = [k for k, name in enumerate(columns) if name not in self.loops.passive]
@@ -354,7 +354,7 @@ def read_origin(table: Path) -> Origin:
 def cells_of(length: float, height: float, thickness: float) -> tuple[int, int, int]:
     """Return cells along, over the height and over the thickness, about cubes."""
     side = (length * height * thickness / CELLS) ** (1.0 / 3.0)
-    along, *across = (round(one / side) for one in (length, height, thickness))
+    along, *across = (round(item / side) for item in (length, height, thickness))
     return max(1, along), max(FEWEST, across[0]), max(FEWEST, across[1])
 
 
@@ -377,9 +377,9 @@ class _Extent:
 def _extent(body: SceneBody) -> _Extent:
     assert body.size is not None
     if body.mesh is not None:
-        one, passive = body.mesh, min(body.mesh.size, PASSIVE * body.length)
-        return _Extent(body.size, one.size, float(f"{passive:.6g}"), one.volume, one.ends)
-    height, thickness = (_up(one) for one in body.size)
+        mesh, passive = body.mesh, min(body.mesh.size, PASSIVE * body.length)
+        return _Extent(body.size, mesh.size, float(f"{passive:.6g}"), mesh.volume, mesh.ends)
+    height, thickness = (_up(item) for item in body.size)
     cells = cells_of(body.length, height, thickness)
     along, *across = (x / n for x, n in zip((body.length, height, thickness), cells, strict=True))
     volume = body.length * height * thickness
@@ -400,7 +400,7 @@ def _tidy(values: np.ndarray) -> np.ndarray:
 
 
 def _rounded(values: Sequence[float] | np.ndarray) -> str:
-    return "[" + ", ".join(f"{float(one):.4g}" for one in _tidy(np.asarray(values))) + "]"
+    return "[" + ", ".join(f"{float(item):.4g}" for item in _tidy(np.asarray(values))) + "]"
 
 
 def _list(values: Iterable[float]) -> str:
@@ -580,26 +580,26 @@ def _meshed(robot: Robot, body: SceneBody, write_mesh: MeshWriter, warn: Warn) -
     done: tuple[str, ...] = ()
     try:
         try:
-            found = cells_between_joints(link.shapes, body)
+            result = cells_between_joints(link.shapes, body)
         except NoSolid as error:
             if link.visual is None:
                 raise
             try:
-                found = cells_between_joints(link.visual(), body)
+                result = cells_between_joints(link.visual(), body)
             except NoSolid:
                 raise error from None
             done = ("visual geometry",)
     except NoSolid as error:
         warn([f"{robot.file}: link {body.link!r} becomes a box: {error}"])
         return body
-    _, height, thickness = map(float, found.extents)
+    _, height, thickness = map(float, result.extents)
     mesh = SolidMesh(
-        write_mesh(found),
-        len(found.cells),
-        found.side,
-        found.volume,
-        found.ends_within(found.side),
-        found.offset(body.length),
-        (*done, *found.done),
+        write_mesh(result),
+        len(result.cells),
+        result.side,
+        result.volume,
+        result.ends_within(result.side),
+        result.offset(body.length),
+        (*done, *result.done),
     )
     return replace(body, size=(height, thickness), mesh=mesh)

@@ -775,11 +775,11 @@ class Arm(Table):
                 "stay solid",
                 ".pattern",
             )
-        for one, name in ((pattern, self.pattern), (self, self.name)):
-            if one.mesh is not None:
+        for item, name in ((pattern, self.pattern), (self, self.name)):
+            if item.mesh is not None:
                 raise Refusal(
                     f"expected an arm made of cells, and cells of its own: {name} has mesh = "
-                    f"{shown(one.mesh)}, whose cells have no partners in another arm",
+                    f"{shown(item.mesh)}, whose cells have no partners in another arm",
                     ".pattern",
                     ".mesh",
                 )
@@ -824,7 +824,7 @@ def _add_material_keys() -> None:
 _add_material_keys()
 
 
-def declare_law(one: LawDeclaration, words: Mapping[str, str]) -> None:
+def declare_law(law_declaration: LawDeclaration, words: Mapping[str, str]) -> None:
     """Let scenes that are read from now on name a kind of material, and keys of its own.
 
     Args:
@@ -833,7 +833,7 @@ def declare_law(one: LawDeclaration, words: Mapping[str, str]) -> None:
     """
     from dolfinopt.scene.schema import Scene
 
-    LAWS[one.kind] = one
+    LAWS[law_declaration.kind] = law_declaration
     fields = Material.model_fields
     fields["kind"].annotation = Literal[tuple(LAWS)]  # type: ignore[assignment]
     for key in words.keys() - fields.keys():

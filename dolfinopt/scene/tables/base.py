@@ -168,11 +168,11 @@ class Table(BaseModel):
             choice = getattr(self, use.choice)
             if choice in use.values.split() if use.values else choice:
                 continue
-            found = f"with {use.choice} = {shown(choice)}, which does not use it"
+            result = f"with {use.choice} = {shown(choice)}, which does not use it"
             if choice is None:
-                found = f"without {use.choice}"
+                result = f"without {use.choice}"
             for key in use.keys.split():
-                self.refuse_stated(key, found, use.choice)
+                self.refuse_stated(key, result, use.choice)
         return self
 
     def refuse_stated(self, key: str, reason: str, *others: str) -> None:

@@ -99,8 +99,8 @@ def check_site(scene: Scene, text: str, at: str, also: tuple[str, ...] = ()) -> 
         allowed = " | ".join(map(shown, (*also, *arms)))
         raise Refusal(f'expected the name of an arm, or "arm.interface": {allowed}', at)
     if interface_number(arms[name], interface) is None:
-        known = (OUTBOARD, *(one.name for one in arms[name].further_interfaces))
-        allowed = " | ".join(shown(f"{name}.{one}") for one in known)
+        known = (OUTBOARD, *(item.name for item in arms[name].further_interfaces))
+        allowed = " | ".join(shown(f"{name}.{item}") for item in known)
         raise Refusal(f"expected an interface of {name}: {allowed}", at)
 
 
@@ -141,13 +141,13 @@ def check_used(scene: Scene) -> None:
     for index, arm in enumerate(scene.arms):
         if arm.design is not None:
             continue
-        sharing = [index, *(k for k, one in enumerate(scene.arms) if one.design == arm.name)]
-        for number, one in enumerate(arm.further_interfaces, start=1):
+        sharing = [index, *(k for k, item in enumerate(scene.arms) if item.design == arm.name)]
+        for number, interface in enumerate(arm.further_interfaces, start=1):
             if not scene.used_interfaces & {(k, number) for k in sharing}:
                 raise Refusal(
-                    f'expected a joint with parent = "{arm.name}.{one.name}", one of [[closures]], '
-                    "the payload or one of [[forces]] there: nothing sits on it",
-                    f"arms.{index}.interfaces.{arm.interfaces.index(one)}.name",
+                    f'expected a joint with parent = "{arm.name}.{interface.name}", one of '
+                    "[[closures]], the payload or one of [[forces]] there: nothing sits on it",
+                    f"arms.{index}.interfaces.{arm.interfaces.index(interface)}.name",
                     "joints",
                 )
 
@@ -347,10 +347,10 @@ def check_parts(one: _Table, table: str) -> None:
             )
 
 
-def check_plane_bearing(one: _Table) -> None:
+def check_plane_bearing(table: _Table) -> None:
     """Refuse springs of a bearing in directions that the plane does not have."""
     for i, direction in OUT_OF_PLANE.items():
-        if one.bearing_stiffness is not None and one.bearing_stiffness[i] > 0.0:
+        if table.bearing_stiffness is not None and table.bearing_stiffness[i] > 0.0:
             raise Refusal(
                 f"expected 0 or inf as number {i + 1}, {direction}: without [[joints]] the machine "
                 "moves in the plane, which holds it there",
@@ -395,7 +395,7 @@ def _part(arm: Arm, joint: Joint | None, key: str) -> Any:
 def check_motor(scene: Scene, index: int) -> None:
     """Refuse a rotor of unknown speed, and a motor's gear at a joint that nothing drives."""
     arm, at = scene.arms[index], ""
-    held = [(k, one) for k, one in enumerate(scene.joints) if one.child == arm.name]
+    held = [(k, item) for k, item in enumerate(scene.joints) if item.child == arm.name]
     joint = held[0][1] if held else None
     if _part(arm, joint, "rotor_inertia") and _part(arm, joint, "gear_ratio") is None:
         if joint is not None and stated_at(joint, "rotor_inertia"):
@@ -406,7 +406,7 @@ def check_motor(scene: Scene, index: int) -> None:
             f"{at}.rotor_inertia",
             f"{at}.gear_ratio",
         )
-    rotors = ["rotor_inertia" in one.model_fields_set for one in (*scene.arms, *scene.joints)]
+    rotors = ["rotor_inertia" in item.model_fields_set for item in (*scene.arms, *scene.joints)]
     # Older files hold the ratio of 1 that was the default.
     if stated_at(arm, "gear_ratio") and arm.gear_ratio != 1.0 and not any(rotors):
         raise Refusal(

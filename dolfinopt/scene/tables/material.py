@@ -75,8 +75,8 @@ class LawDeclaration:
 # Keys of every kind.
 OF_ALL = "kind", "young_modulus", "poisson_ratio", "density"
 LAWS: dict[str, LawDeclaration] = {
-    one.kind: one
-    for one in (
+    item.kind: item
+    for item in (
         LawDeclaration("isotropic", has_strength=True, scales=True),
         LawDeclaration("orthotropic", ("shear_modulus",), directed=True),
     )
@@ -196,8 +196,8 @@ def check_orthotropic(solid: Material, dim: int | None) -> None:
     in_space = dim == 3 or isinstance(ratio, tuple)
     ratios = ratio if isinstance(ratio, tuple) else (ratio,) * 3
     scaled = [nu * (E[j] / E[i]) ** 0.5 for (i, j), nu in zip(PAIRS, ratios, strict=True)]
-    for (i, j), one in zip(PAIRS, scaled[: 3 if in_space else 1], strict=False):
-        if abs(one) >= 1.0:
+    for (i, j), item in zip(PAIRS, scaled[: 3 if in_space else 1], strict=False):
+        if abs(item) >= 1.0:
             raise Refusal(
                 f"expected |nu{i + 1}{j + 1}| < sqrt(E{i + 1}/E{j + 1}) = "
                 f"{(E[i] / E[j]) ** 0.5:.4g}: otherwise a deformation would release energy",

@@ -312,7 +312,7 @@ class Motion(Table):
         key = ("motion", "shape") if self.coefficients else ("objective", "kind")
         if len(self.coefficients) > MOST_COEFFICIENTS:
             raise Refusal(f"expected at most {MOST_COEFFICIENTS} coefficients", "motion.shape")
-        rates = any(one in scene.constraints.limits for one in OF_PATH)
+        rates = any(item in scene.constraints.limits for item in OF_PATH)
         if self.path in ("points", "joints") or (rates and self.path == "rotation"):
             raise Refusal(
                 'expected "arc" or "line", or "rotation" without limits along the path: the '
@@ -339,8 +339,8 @@ class Motion(Table):
                 "objective.gradient",
                 key,
             )
-        for k, one in enumerate(scene.scenarios):
-            if any(change.lstrip().startswith("motion.") for change in one.changes):
+        for k, scenario in enumerate(scene.scenarios):
+            if any(change.lstrip().startswith("motion.") for change in scenario.changes):
                 raise Refusal(
                     "expected no changes of the motion, whose law has variables",
                     f"scenarios.{k}.changes",

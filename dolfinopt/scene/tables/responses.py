@@ -174,8 +174,8 @@ class Declaration:
 
 
 DECLARED: dict[str, Declaration] = {
-    one.name: one
-    for one in (
+    item.name: item
+    for item in (
         Declaration(
             "mass",
             "mass of the arms",
@@ -425,7 +425,7 @@ def objective_kinds() -> list[str]:
 
 def limited_by(key: str) -> Declaration:
     """Return the response that a key of [constraints], or the volume's, limits."""
-    return next(one for one in (*DECLARED.values(), VOLUME) if one.key == key)
+    return next(item for item in (*DECLARED.values(), VOLUME) if item.key == key)
 
 
 def asked(scene: Scene) -> list[Declaration]:
