@@ -222,7 +222,7 @@ def body_mesh(
     cell: float,
     coarser: float = 1.0,
     finer: Sequence[np.ndarray] = (),
-    turn: float | np.ndarray = TURN,
+    turn: float = TURN,
 ) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
@@ -232,16 +232,15 @@ def body_mesh(
         coarser: factor of the sides of all triangles.
         finer: places (n, 2), m, near which sides are half as long, and the outline turns by `FINE`
             along them; half of both for every further array.
-        turn: of the outline along a side elsewhere, rad; one for all pieces, or one each.
+        turn: of the outline along a side elsewhere, rad.
 
     Raises:
         InputError: straight sides along its curves cross each other, however short.
     """
-    turns = np.broadcast_to(turn, len(shape.pieces))
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = _sizes(shape, samples, cell, finer, turns)
+    sizes = _sizes(shape, samples, cell, finer, turn)
     for _ in range(FINER):
-        outline = _outline(shape, samples, [coarser * size for size in sizes], coarser * turns)
+        outline = _outline(shape, samples, [coarser * size for size in sizes])
         if outline.is_simple:  # Gmsh would end the process
             points, triangles = _triangulated(outline)
             mesh = BodyMesh(shape, points, triangles, outline.sides, outline.piece, outline.span)
@@ -290,15 +289,13 @@ class _Outline:
         return np.vstack(found)
 
 
-def _outline(
-    shape: Shape, samples: Sequence[np.ndarray], sizes: Sequence[np.ndarray], turns: np.ndarray
-) -> _Outline:
+def _outline(shape: Shape, samples: Sequence[np.ndarray], sizes: Sequence[np.ndarray]) -> _Outline:
     loops, piece, span, spacing = [], [], [], []
     number = 0
     for loop in shape.loops:
         corners = []
         for one in loop:
-            t, h = _divided(one.curve, samples[number], sizes[number], turns[number])
+            t, h = _divided(one.curve, samples[number], sizes[number])
             corners.append(one.curve.at(t[:-1]))
             piece.append(np.full(len(t) - 1, number))
             span.append(np.stack([t[:-1], t[1:]], axis=1))
@@ -322,7 +319,7 @@ def _sizes(
     samples: Sequence[np.ndarray],
     cell: float,
     finer: Sequence[np.ndarray],
-    turns: np.ndarray,
+    turn: float,
 ) -> list[np.ndarray]:
     """Return the wanted sides of cells at the samples of every piece, m."""
     curves = shape.curves
@@ -331,52 +328,47 @@ def _sizes(
     bend = np.abs(np.concatenate([curvature(c, t) for c, t in zip(curves, samples, strict=True)]))
     bend = np.maximum(bend, 1e-9 / cell)
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
-    wall = facing(points, inward, near, 1.0)
-    turn = np.repeat(turns, [len(t) for t in samples])
-    side = np.minimum(wall, LARGEST * cell)  # one cell across a member
+    side = np.minimum(_widths(points, inward, near), LARGEST * cell)  # one cell across a member
+    turns = np.full(len(points), turn)
     for number, places in enumerate(finer):
-        size = np.minimum(side, turn / bend)
+        size = np.minimum(side, turns / bend)
         here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)
-        turn = np.where(here, np.minimum(turn, FINE * 0.5**number), turn)
+        turns = np.where(here, np.minimum(turns, FINE * 0.5**number), turns)
         side = np.where(here, 0.5 * side, side)
-    size = np.maximum(np.minimum(side, turn / bend), SMALLEST * cell)
+    size = np.maximum(np.minimum(side, turns / bend), SMALLEST * cell)
     for _ in range(3):
         size = (size[near] + GROWTH * apart).min(axis=1)
     return np.split(size, np.cumsum([len(t) for t in samples])[:-1])
 
 
-def facing(points: np.ndarray, inward: np.ndarray, near: np.ndarray, side: float) -> np.ndarray:
-    """Return the width (m,) of members, or of gaps, beside points of an outline or surface, m.
+def _widths(points: np.ndarray, inward: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return the width (n,) of members beside points of an outline, m.
 
-    The diameter of the least circle, or ball, that touches it at the point and goes through another
-    one, whose normal points the other way; infinite where none is near.
+    The diameter of the least circle that touches it at the point and goes through another one,
+    whose normal points the other way; infinite where none is near.
 
     Args:
-        points: (n, d) m.
-        inward: (n, d) unit normals into the material.
-        near: (m, k) neighbours of the first m points.
-        side: 1 of members, -1 of gaps.
+        points: (n, 2) m.
+        inward: (n, 2) unit normals into the material.
+        near: (n, k) neighbours of the points.
     """
-    own, into = points[: len(near)], inward[: len(near)]
-    to = points[near] - own[:, None]
-    depth = side * np.einsum("nkd,nd->nk", to, into)
-    across = np.einsum("nkd,nd->nk", inward[near], into) < OPPOSED
+    to = points[near] - points[:, None]
+    depth = np.einsum("nkd,nd->nk", to, inward)
+    across = np.einsum("nkd,nd->nk", inward[near], inward) < OPPOSED
     square = np.square(to).sum(axis=2)
     across &= depth > 1e-3 * np.sqrt(square)
     width = np.divide(square, depth, out=np.full(depth.shape, np.inf), where=across)
     return width.min(axis=1)
 
 
-def _divided(
-    curve: Curve, t: np.ndarray, size: np.ndarray, turn: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _divided(curve: Curve, t: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return parameters of nodes along a curve, ends included, and sizes at all but the last."""
     step = np.linalg.norm(np.diff(curve.at(t), axis=0), axis=1)
     passed = np.append(0.0, np.cumsum(step * 0.5 * (1.0 / size[:-1] + 1.0 / size[1:])))
     count = int(np.ceil(passed[-1] - 0.2))
     if isinstance(curve, Arc):
         # Evenly: the area is exact then, see `outline_places`.
-        at = np.linspace(0.0, 1.0, max(count, int(np.ceil(abs(curve.sweep) / turn)), 1) + 1)
+        at = np.linspace(0.0, 1.0, max(count, 1) + 1)
     else:
         count = max(count, 2 if isinstance(curve, Spline) else 1)
         at = np.interp(np.linspace(0.0, passed[-1], count + 1), passed, t)

@@ -18,7 +18,6 @@ from typing import Any, cast
 import numpy as np
 
 from dolfinopt.arms.arm import stiffening_of
-from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import Column, refined
 from dolfinopt.part.folder import Forms, Saved
@@ -30,7 +29,7 @@ from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.outline import without_stubs
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.simpler import without_teeth
-from dolfinopt.part.problem import RESERVE, Problem, State
+from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import Search
 from dolfinopt.part.solid.part import SolidPart
 from dolfinopt.responses.constraints import Limit
@@ -43,9 +42,6 @@ START = 1.2  # distance of the first sides from the densities' outline, cells
 # Width of members that go where they end nowhere, cells: else the rod misses its stress by 45 %.
 STUB = 1.5
 SMALLEST = 3.0  # area of a hole that a search begins with, squared cells
-FEW = 4  # steps without the most promising strut, in trial
-MISSED, GAIN = 0.3, 5e-4  # of a missed limit in what a strut promises; relative, that it must bring
-LONG = 4.0  # work of a simulation without a strut, over that with it, at most
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 
 Outlines = Mapping[int, FreeSides]
@@ -199,7 +195,7 @@ def optimize_parts(
                 found.append(descent.so_far(name))
             break
     gc.unfreeze()
-    best = min([given, *found], key=lambda one: _rank(scene, one.value, one.limits))
+    best = min([given, *found], key=lambda one: _rank(scene, one))
     others = tuple(one for one in found if one is not best)
     return Optimized(best, others, mesh_parts(best.parts), given.value, interrupted)
 
@@ -231,17 +227,10 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
     return (made if found is None else found[0]).simplified(without_teeth)[0]
 
 
-def _rank(scene: Scene, value: float, limits: tuple[Limit, ...]) -> tuple[float, float]:
+def _rank(scene: Scene, found: Found) -> tuple[float, float]:
     """Return what orders designs, best first: feasible ones by their objective, else by excess."""
-    excess = max((0.0 if one.met else one.excess for one in limits), default=0.0)
-    return excess, -value if objective_of(scene).turned else value
-
-
-def _tightened(fine: Limit, coarse: Limit) -> float:
-    """Return by how much a limit counts more on the coarse mesh, so that the fine one keeps it."""
-    if fine.least:
-        return (coarse.value / fine.value) ** 2 * (1.0 + RESERVE)
-    return fine.value / coarse.value * (1.0 + RESERVE)
+    excess = max((0.0 if one.met else one.excess for one in found.limits), default=0.0)
+    return excess, -found.value if objective_of(scene).turned else found.value
 
 
 def _judged(scene: Scene, parts: dict[int, Part]) -> Column:
@@ -255,13 +244,11 @@ def _judged(scene: Scene, parts: dict[int, Part]) -> Column:
 
 
 class Descent:
-    """Searches from one start: steps, struts left out, limits tightened by a finer mesh.
+    """The search from one start: steps, and limits tightened by what finer meshes show.
 
     Attributes:
-        problem: with limits as tight as the finer mesh asks for.
-        state: the best of the searches that have ended.
+        problem: with limits as tight as finer meshes ask for.
         search: that goes on.
-        done: steps taken in those that have ended.
         best: of what finer meshes have judged, and `forms` its outlines.
     """
 
@@ -277,49 +264,41 @@ class Descent:
     ):
         """Begin at outlines, or where a search from them is known to have been."""
         self.iterations, self.tell, self.number, self.keep = iterations, tell, number, keep
-        self.known, self.done = known, 0
         self.best, self.forms = cast(Found | None, None), cast(Outlines, {})
+        self.ending, done = "", 0
         if known is not None:
             problem = replace(problem, tightened=known.tightened)
             outlines, self.forms = _restored(outlines, known.forms), _restored(outlines, known.best)
-            self.done = known.done
-        self.state = problem.evaluated(outlines, {})
-        decided = stiffening_of(self.state.simulated.arms)
-        self.problem = replace(problem, stiffening=decided.on if decided else None)
-        self.search = Search(self.problem, self.state)
+            self.ending, done = known.ending, known.done
+        state = problem.evaluated(outlines, {})
+        decided = stiffening_of(state.simulated.arms)
+        problem = replace(problem, stiffening=decided.on if decided else None)
+        self.search = Search(problem, state, done)
 
     def found(self, start: str) -> Found:
         """Search to the end, and return the best of what finer meshes have judged."""
-        if self.known is not None and self.forms:  # by an earlier call
-            now, self.state = self.state, replace(self.state, outlines=self.forms)
-            found, _ = self._judged(start, self.known.ending)
-            if self.known.ending:
+        if self.forms:  # by an earlier call
+            found = self._judged(start, self.forms)
+            if self.ending:
                 return found
-            self.state = now
-        ending = self._searched()
-        found, limits = self._judged(start, ending)
-        for _ in range(REPAIRS):
-            if all(one.met for one in found.limits):
+        self.ending = self.search.run(self.iterations, self._told)
+        for repairs in range(1 + REPAIRS):
+            found = self._judged(start, self.search.state.outlines, self.search.meshed)
+            if repairs == REPAIRS or all(one.met for one in found.limits):
                 break
-            self._repair(limits)
-            found, limits = self._judged(start, ending)
-        self._keep(ending)
-        return replace(found, ending=ending)
+            self._repair(found.limits)
+        self._keep()
+        assert self.best is not None
+        return replace(self.best, iterations=self.search.steps, ending=self.ending)
 
-    def _keep(self, ending: str = "") -> None:
+    def _keep(self) -> None:
         """Say where the search is."""
-        state = self._best_state()
         forms, best = (
-            {k: one.arrays for k, one in some.items()} for some in (state.outlines, self.forms)
+            {k: one.arrays for k, one in some.items()}
+            for some in (self.search.state.outlines, self.forms)
         )
-        done = self.done + self.search.steps
-        self.keep(Saved(self.number, done, ending, self.problem.tightened, forms, best))
-
-    def _best_state(self) -> State:
-        """Return the best state so far, that of the last step among them."""
-        search = self.search
-        every = self.state, search.best, search.state, search.met
-        return min((one for one in every if one is not None), key=lambda one: one.rank)
+        tightened = self.search.problem.tightened
+        self.keep(Saved(self.number, self.search.steps, self.ending, tightened, forms, best))
 
     def _told(self, line: str) -> None:
         """Tell of a step, which is kept first."""
@@ -328,94 +307,34 @@ class Descent:
 
     def so_far(self, start: str) -> Found:
         """Return the best so far of a search that was interrupted."""
-        self.state = self._best_state()
-        self.done += self.search.steps
-        return replace(self._judged(start, "")[0], ending="interrupted")
+        self.ending = "interrupted"
+        self._judged(start, self.search.state.outlines, self.search.meshed)
+        assert self.best is not None
+        return self.best
 
-    def _judged(self, start: str, ending: str) -> tuple[Found, tuple[Limit, ...]]:
-        """Return the best of what is judged, the state now among it, and the state's limits."""
-        # Sides that all but touch cannot be meshed: then those before them are judged.
-        for outlines in (self.state.outlines, *reversed(self.search.passed)):
-            made = self.problem.parts_of(outlines)
+    def _judged(self, start: str, *tried: Outlines) -> Found:
+        """Return what finer meshes say of the first outlines that can be meshed."""
+        scene = self.search.problem.scene
+        for outlines in tried:  # sides that all but touch cannot
+            made = self.search.problem.parts_of(outlines)
             with suppress(ConvergenceError, InputError):
-                column = _judged(self.problem.scene, made)
+                column = _judged(scene, made)
                 break
         else:
-            if self.best is None:
-                raise ConvergenceError("no parts of this search can be simulated")
-            return self.best, self.best.limits
-        self.state = replace(self.state, outlines=outlines)
-        found = Found(start, made, self.done, column.objective, column.limits, ending)
-        if self.best is None or self._rank(found) < self._rank(self.best):
+            raise ConvergenceError("no parts of this search can be simulated")
+        steps, value, limits = self.search.steps, column.objective, column.limits
+        found = Found(start, made, steps, value, limits, self.ending)
+        if self.best is None or _rank(scene, found) < _rank(scene, self.best):
             self.best, self.forms = found, outlines
-        return replace(self.best, iterations=self.done), found.limits
-
-    def _rank(self, found: Found) -> tuple[float, float]:
-        return _rank(self.problem.scene, found.value, found.limits)
-
-    def _tighten(self, limits: tuple[Limit, ...]) -> None:
-        """Go on with limits that are tighter by what the finer mesh shows."""
-        self.problem, self.state = self.problem.calibrated(self.state)
-        loop = {one.name: one for one in self.problem.limits_of(self.state)}
-        missing = {one.name: _tightened(one, loop[one.name]) for one in limits if not one.met}
-        self.tell("tightened by what the finer mesh shows: " + ", ".join(missing))
-        self.problem = replace(self.problem, tightened={**self.problem.tightened, **missing})
-
-    def _searched(self) -> str:
-        """Go from the state to the best one that steps lead to; return why it ended."""
-        self.search = Search(self.problem, self.state)
-        self.state = self.state.released
-        ending = self._ran(self.search)
-        self.state = self._best_state()
-        while self.done < self.iterations and self._without_struts():
-            pass
-        return ending
-
-    def _ran(self, search: Search) -> str:
-        """Let a search take the steps that are left; return why it ended."""
-        self.search = search
-        ending = search.run(self.iterations - self.done, self._told, self.done)
-        self.done, search.steps = self.done + search.steps, 0
-        return ending
+        return found
 
     def _repair(self, limits: tuple[Limit, ...]) -> None:
-        """Take a few more steps, which meet the limits as tight as the finer mesh asks for."""
-        self._tighten(limits)
-        self.search = Search(self.problem, self.state)
-        self.search.restore(self._told, self.done)
-        self.done, self.search.steps = self.done + self.search.steps, 0
-        self.state = self.search.state
-
-    def _without_struts(self) -> bool:
-        """Go on from the best state without a strut, if a few steps make one that is better."""
-        promised, state = [], self.state
-        plain = replace(self.problem, local={})
-        with counted() as work:
-            plain.evaluated(state.outlines, {}, state.solutions)
-        for k, one in state.outlines.items():
-            for other in one.without_struts():
-                try:
-                    with counted(LONG * work.done):  # what takes long hardly hangs together
-                        outlines = {**state.outlines, k: other}
-                        tried = plain.evaluated(outlines, {}, state.solutions).released
-                except (ConvergenceError, InputError):
-                    continue
-                missed = np.maximum(tried.values[1:], 0.0).max(initial=0.0)
-                promised.append((tried.values[0] + MISSED * abs(tried.values[0]) * missed, tried))
-        if not promised:
-            return False
-        _, tried = min(promised, key=lambda one: one[0])
-        search = Search(plain, tried)
-        search.run(min(FEW, self.iterations - self.done), lambda _: None, self.done)
-        self.done += search.steps
-        best = search.best.rank
-        if best[0] > state.rank[0] or best[1] > state.rank[1] - GAIN * abs(state.values[0]):
-            return False
-        self.tell("better without a strut")
-        self.state = search.best
-        self._ran(Search(search.problem, search.best))
-        self.state = self._best_state()
-        return True
+        """Take a few more steps, which meet limits that are tighter by what is missed."""
+        missed = [one for one in limits if not one.met]
+        self.tell("tightened by what finer meshes show: " + ", ".join(one.name for one in missed))
+        problem = self.search.problem.tighter(missed)
+        self.search = Search(problem, self.search.state, self.search.steps)
+        self.search.restore(self._told)
 
 
 def _restored(outlines: Outlines, forms: Forms) -> dict[int, FreeSides]:

@@ -11,10 +11,10 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from dolfinopt.part.check import STRESS, Simulated, simulate_parts
-from dolfinopt.part.mesh import FINE, TURN, BodyMesh, PlateMesh
+from dolfinopt.part.mesh import BodyMesh, PlateMesh
 from dolfinopt.part.part import Part, PartMesh
 from dolfinopt.part.plane.free_sides import FreeSides
-from dolfinopt.part.stress import OutlineStress
+from dolfinopt.part.stress import HOT, OutlineStress
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
 from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient
@@ -26,7 +26,6 @@ from dolfinopt.scene.load import Scene
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
 NEAR = -0.2  # of the stress of a place: from there on a finer mesh is asked
-ALLOWED = 0.05  # excess of a limit that a state may have for a better objective on the way
 
 Place = tuple[int, int]  # number of an arm, and of a piece of its outline
 
@@ -45,6 +44,7 @@ class State:
         places: relative constraint of the stress of every fillet and side.
         means: p-mean, Pa, of the stress of each of them, which it follows while a mesh does.
         owners: (n,) number of the place of every node of the arms' meshes; -1: none.
+        hot: (n, d) nodes of the arms' meshes where a finer mesh is worth it, m.
     """
 
     outlines: Mapping[int, FreeSides]
@@ -57,6 +57,7 @@ class State:
     places: Mapping[Place, float] = field(default_factory=dict)
     means: Mapping[Place, float] = field(default_factory=dict)
     owners: Mapping[int, np.ndarray] = field(default_factory=dict)
+    hot: Mapping[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def values(self) -> np.ndarray:
@@ -74,21 +75,15 @@ class State:
         return np.concatenate([[objective], self.smooth / held - 1.0, self.shares])
 
     @property
-    def rank(self) -> tuple[float, float]:
-        """What orders states, best first: feasible ones by their objective, else by excess."""
-        excess, value = self.values[1:].max(initial=0.0), self.values[0]
-        return max(excess - ALLOWED, 0.0), value + abs(value) * max(excess - EXCESS, 0.0)
+    def excess(self) -> float:
+        """The largest relative violation of a limit, 0 where all are met."""
+        return float(self.values[1:].max(initial=0.0))
 
     @property
     def mass(self) -> float:
         """Of the parts, kg."""
         bodies = self.simulated.trajectory.mechanism.bodies
         return float(sum(bodies[k].mass for k in self.bodies))
-
-    @property
-    def released(self) -> State:
-        """The same without the machine's matrices, which take a GB of a solid."""
-        return replace(self, simulated=replace(self.simulated, arms={}))
 
     @property
     def solutions(self) -> Any:
@@ -105,7 +100,7 @@ class Problem:
         parts: as they were, of the arms that repeat another's design, too.
         tightened: factor by the name of a limit, by which its value counts more.
         local: stress of a place on a finer mesh, over its limit, by the p-mean on this one, 1/Pa.
-        turns: (n,) of all pieces of an arm's sides along a side of their mesh, rad.
+        finer: places of every arm where its mesh is finer, see `part.Part.mesh`.
         stiffening: whether bodies have geometric stiffness; None: as the scene states.
     """
 
@@ -113,7 +108,7 @@ class Problem:
     parts: Mapping[int, Any]
     tightened: Mapping[str, float]
     local: Mapping[Place, float] = field(default_factory=dict)
-    turns: Mapping[int, np.ndarray] = field(default_factory=dict)
+    finer: Mapping[int, Sequence[np.ndarray]] = field(default_factory=dict)
     stiffening: bool | None = None
 
     def every(self, outlines: Mapping[int, FreeSides]) -> dict[int, FreeSides]:
@@ -143,7 +138,7 @@ class Problem:
         """
         every = self.every(outlines)
         if not bodies:
-            bodies = {k: one.meshed(self.turns.get(k)) for k, one in every.items()}
+            bodies = {k: one.meshed(self.finer.get(k, ())) for k, one in every.items()}
         parts = {k: one.current for k, one in every.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
         if self.stiffening is not None:
@@ -156,44 +151,41 @@ class Problem:
         for one, value, limit in zip(limits, found.constraints, found.smooth_limits, strict=True):
             if one.quantity not in ("volume_fraction", STRESS):
                 rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
-        limit, owners = self.scene.constraints.limit(STRESS), dict[int, np.ndarray]()
-        places, means = dict[Place, float](), dict[Place, float]()
-        if limit is not None:
-            places, means, owners = self._places(simulated, every, bodies, limit)
         known, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
         shares = [share for share, _ in self._volumes(outlines)]
         smooth, most, areas = (np.array(one, dtype=float) for one in (smooths, held, shares))
-        given = outlines, bodies, simulated, tuple(known), smooth, most, areas
-        return State(*given, places, means, owners)
+        state = State(outlines, bodies, simulated, tuple(known), smooth, most, areas)
+        limit = self.scene.constraints.limit(STRESS)
+        return state if limit is None else self._with_places(state, every, limit)
 
-    def _places(
-        self,
-        simulated: Simulated,
-        every: Mapping[int, FreeSides],
-        bodies: Mapping[int, Any],
-        limit: float,
-    ) -> tuple[dict[Place, float], dict[Place, float], dict[int, np.ndarray]]:
-        """Return the relative constraint and p-mean of every place, and the places of all nodes."""
-        scene, found, means, owners = simulated.scene, dict[Place, float](), {}, {}
-        motions = motions_of(simulated.trajectory)
+    def _with_places(self, state: State, every: Mapping[int, FreeSides], limit: float) -> State:
+        """Return a state with the relative constraint and p-mean of every place."""
+        scene, motions = state.simulated.scene, motions_of(state.simulated.trajectory)
+        places, means, owners, stresses = dict[Place, float](), {}, {}, {}
         factor = self._factor(Limit(STRESS, "", 0.0, limit, "Pa")) / limit
         for k, loads in arm_loads(scene, motions).items():
-            state, part = simulated.arms[k].current, every[k].current
-            points = part.stress(state, state.load_fields)
+            now, part = state.simulated.arms[k].current, every[k].current
+            points = part.stress(now, now.load_fields)
             motion = [one.coefficients for one in loads]
-            each = [maxima(MPI.COMM_SELF, points.A, a)[0] for a in motion]
-            stress = np.max(each, axis=0)
+            stress = np.max([maxima(MPI.COMM_SELF, points.A, a)[0] for a in motion], axis=0)
             means_of = points.means(motion, self._exponent)
-            face = _face(bodies[k])
+            face = _face(state.bodies[k])
             near = cKDTree(face.points[face.sides[:, 0]]).query(points.places[:, :2])[1]
             counts = part.regular(points.places, scene.objective.stress_margin)
             owners[k] = np.where(counts & (points.weights > 0.0), face.owners[near], -1)
+            stresses[k] = points.places, np.where(counts, stress, 0.0)
             for piece in np.unique(owners[k][owners[k] >= 0]).tolist():
                 here, key = owners[k] == piece, (k, piece)
                 means[key] = means_of(here)
-                as_found = float(stress[here].max()) * factor / means[key]
-                found[key] = means[key] * self.local.get(key, as_found) - 1.0
-        return found, means, owners
+                as_is = float(stress[here].max()) * factor / means[key]
+                places[key] = means[key] * self.local.get(key, as_is) - 1.0
+        largest = max(float(stress.max()) for _, stress in stresses.values())
+        hot = {
+            k: at[stress > HOT * stress.max()]
+            for k, (at, stress) in stresses.items()
+            if stress.max() > HOT * largest
+        }
+        return replace(state, places=places, means=means, owners=owners, hot=hot)
 
     def stress_slopes(self, state: State, keys: Sequence[Place]) -> list[np.ndarray]:
         """Return the derivatives (n,) of `State.places` of some places."""
@@ -213,28 +205,32 @@ class Problem:
         return OutlineStress(options, parts, nodes), analysis_of(*given)
 
     def calibrated(self, state: State) -> tuple[Problem, State]:
-        """Return the problem that knows what finer meshes say, and a state on new meshes."""
-        plain = replace(self, local={}, turns=_turns(state, FINE))
-        fresh = plain.evaluated(state.outlines, {}, state.solutions)
-        if max(fresh.places.values(), default=-1.0) < NEAR:
-            return plain, fresh
-        finest = replace(plain, turns=_turns(fresh, 0.5 * FINE))
-        fine = finest.evaluated(state.outlines, {}, fresh.solutions).places
-        places = {
-            key: fine.get(key, value) if value > NEAR else value
-            for key, value in fresh.places.items()
-        }
+        """Return the problem that knows what finer meshes say, and a state on new meshes.
+
+        They are refined as those of the check, twice where stress comes near its limit. The first
+        one is that of the state; of the second one the stress of every place counts.
+        """
+        problem = replace(self, local={}, finer={})
+        fine = problem.evaluated(state.outlines, {}, state.solutions)
+        if max(fine.places.values(), default=-1.0) < NEAR:
+            return problem, fine
+        for _ in range(2):
+            fresh, plain = fine, problem
+            finer = {k: (*plain.finer.get(k, ()), places) for k, places in fresh.hot.items()}
+            problem = replace(plain, finer={**plain.finer, **finer})
+            fine = problem.evaluated(state.outlines, {}, fresh.solutions)
+        places = {key: fine.places.get(key, value) for key, value in fresh.places.items()}
         local = {key: (1.0 + value) / fresh.means[key] for key, value in places.items()}
         return replace(plain, local=local), replace(fresh, places=places)
 
-    def limits_of(self, state: State) -> tuple[Limit, ...]:
-        """Return the scene's limits, but for the volume's, with what a state makes of them."""
-        limit = self.scene.constraints.limit(STRESS)
-        if limit is None or not state.places:
-            return state.limits
-        stress = Limit(STRESS, "", 0.0, limit, "Pa")
-        true = (1.0 + max(state.places.values())) * limit / self._factor(stress)
-        return (*state.limits, replace(stress, value=true))
+    def tighter(self, missed: Sequence[Limit]) -> Problem:
+        """Return the problem with limits that are tighter by what finer meshes miss."""
+        # Lower limits count by their squares, as those of frequencies.
+        tightened = {
+            one.name: self._factor(one) * (1.0 + one.excess) ** (2 if one.least else 1)
+            for one in missed
+        }
+        return replace(self, tightened={**self.tightened, **tightened})
 
     def _factor(self, one: Limit) -> float:
         return self.tightened.get(one.name, 1.0 + RESERVE)
@@ -264,8 +260,6 @@ class Problem:
 
     def slopes(self, state: State) -> np.ndarray:
         """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""
-        if not state.simulated.arms:  # they were released
-            state = self.evaluated(state.outlines, state.bodies, state.solutions)
         one = state.simulated
         given = one.scene, one.partition, one.arms, one.trajectory
         sign = -1.0 if objective_of(self.scene).turned else 1.0
@@ -291,16 +285,6 @@ class Problem:
             by_nodes = np.array([rows[number][k][order] for number in some])
             found[self.scene.patterns.get(k, k)][some] += every[k].by_x(body, by_nodes)
         return np.hstack([*found.values()])
-
-
-def _turns(state: State, fine: float) -> dict[int, np.ndarray]:
-    """Return the turns (n,) of all pieces along a side of a mesh, fine where stress is near."""
-    found = {}
-    for k, body in state.bodies.items():
-        found[k] = np.full(len(_face(body).shape.pieces), TURN)
-        near = [piece for (j, piece), value in state.places.items() if j == k and value > NEAR]
-        found[k][near] = fine
-    return found
 
 
 def _face(mesh: Any) -> BodyMesh:

@@ -38,11 +38,11 @@ ENDS = 1.5  # of the way of a side's end, that a corner may go in a step
 # Of the box of a variable: after a step in the direction of the one before, in the other; bounds.
 # On lightest_two_arm 24 steps come to 1.077 kg for 1.088.
 ON, BACK, STILL, BOUNDS = 1.2, 0.6, 0.01, (0.05, 8.0)
-HARDLY = 1e-5  # relative fall that a step must promise
 # Of the promised fall: what a step must bring, and what makes the next one shorter, or longer.
 ACCEPTED, POOR, GOOD = 0.05, 0.25, 0.6
 SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
-PATIENCE = 3  # times that no step betters the parts on a mesh, before the search ends
+AGAIN = 0.1  # trust region on a new mesh after no step bettered the parts, at least
+ALLOWED = 0.05  # relative excess of a limit above which a search has not settled
 
 Tell = Callable[[str], None]
 
@@ -118,87 +118,60 @@ class Search:
     """Steps within a trust region from one state on.
 
     Attributes:
-        best: the best state so far, on a mesh of its own; it may miss a limit by a little.
-        met: the best one that keeps all limits; None: there was none.
-        passed: outlines of the last mesh and of those since then.
+        state: now.
+        meshed: outlines of the last meshes that were made anew.
         steps: taken.
-        spent: whether no more iterations were allowed.
     """
 
-    def __init__(self, problem: Problem, state: State):
-        """Begin at a state."""
-        self.problem, self.state, self.best = problem, state, state.released
-        self.met: State | None = None
-        self.passed = [dict(state.outlines)]
-        # Without stress there is nothing that a finer mesh of the first state would tell.
-        self.since, self.falls = FOLLOWED, list[float]()
-        if not state.places:
-            self.since, self.falls = 0, [self.best.rank[1]]
-        self.steps, self.lost, self.spent = 0, 0, False
+    def __init__(self, problem: Problem, state: State, steps: int = 0):
+        """Begin at a state, after some steps."""
+        self.problem, self.state, self.meshed = problem, state, state.outlines
+        self.since, self.falls, self.steps = FOLLOWED, list[float](), steps
         self.radius, self.price = FIRST_RADIUS, PRICE
         self.H, self.way, self.reach = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
         self.priced: set[Place] = set()
         self.rows: dict[Place, tuple[np.ndarray, int]] = {}
         self.before: tuple[Step, Linear] | None = None
 
-    def run(self, iterations: int, tell: Tell, first: int) -> str:
-        """Take so many steps at most; return why the search ended."""
-        self.spent = False
+    def run(self, iterations: int, tell: Tell) -> str:
+        """Take steps, so many in all at most; return why the search ended."""
         while True:
             if self.since >= FOLLOWED or self.steps >= iterations:
                 self._mesh_anew()
                 if self._settled() and not self._simplified():
                     return "settled"
             if self.steps >= iterations:
-                self.spent = True
-                return f"{first + iterations} iterations"
-            if not self._step():
-                self.lost += 1
-                if self.since == 0 or self.lost > PATIENCE:
-                    if self._simplified():
-                        continue
-                    return "no step betters the parts"
-                self.since, self.radius = FOLLOWED, max(self.radius, 0.1)
-                continue
-            self.steps += 1
-            tell(self._line(first + self.steps))
+                return f"{iterations} iterations"
+            if self._step():
+                tell(self._line())
+            elif self.since > 0:
+                self.since, self.radius = FOLLOWED, max(self.radius, AGAIN)
+            elif not self._simplified():
+                return "no step betters the parts"
 
-    def restore(self, tell: Tell, first: int) -> None:
+    def restore(self, tell: Tell) -> None:
         """Take a few steps that meet the limits above all; as many as that needs."""
-        if self.since >= FOLLOWED:
-            self._mesh_anew()
+        self._mesh_anew()
         self.radius = NEARBY  # what the finer mesh says holds nearby
         for _ in range(RESTORING):
             self.price = DEAR
-            if self.state.values[1:].max(initial=0.0) <= EXCESS or not self._step():
+            if self.state.excess <= EXCESS or not self._step():
                 break
-            self.steps += 1
-            tell(self._line(first + self.steps))
+            tell(self._line())
 
     def _mesh_anew(self) -> None:
-        """Go on with new meshes; the state on them may be the best one."""
+        """Go on with new meshes."""
         if self.falls and len(self.falls) % SIMPLER == 0:
             self._simplified()
         try:
             self.problem, self.state = self.problem.calibrated(self.state)
         except (ConvergenceError, InputError):  # sides that all but touch
-            outlines = self.best.outlines
-            fresh = self.problem.evaluated(outlines, {}, self.best.solutions)
-            self.problem, self.state = self.problem.calibrated(fresh)
+            before = replace(self.state, outlines=self.meshed)
+            self.problem, self.state = self.problem.calibrated(before)
             self.radius *= 0.5
-        self.since, self.before = 0, None
-        self.passed = [dict(self.state.outlines)]
-        if not self.falls or self.state.rank <= self.best.rank:
-            self.best = self.state.released
-        self.falls.append(self.best.rank[1])
-        self._keep_met()
-
-    def _keep_met(self) -> None:
-        """Keep the state if it meets all limits and is better than those before."""
-        values = self.state.values
-        if values[1:].max(initial=0.0) <= EXCESS:
-            if self.met is None or values[0] < self.met.values[0]:
-                self.met = self.state.released
+        self.since, self.before, self.meshed = 0, None, self.state.outlines
+        value = self.state.values[0]
+        self.falls.append(value + abs(value) * self.state.excess)
 
     def _simplified(self) -> bool:
         """Go on without sides that have vanished and holes that close, if that costs little."""
@@ -219,16 +192,16 @@ class Search:
         return self.state is not before
 
     def _settled(self) -> bool:
-        if len(self.falls) < 3 or self.best.rank[0] > 0.0:
+        if len(self.falls) < 3 or self.state.excess > ALLOWED:
             return False
         return bool(self.falls[-3] - self.falls[-1] < SETTLED * abs(self.falls[-1]))
 
-    def _line(self, number: int) -> str:
+    def _line(self) -> str:
         one = self.state
-        worst = one.values[1:].max(initial=0.0)
-        words = "limits met" if worst <= EXCESS else f"{100.0 * worst:.2g} % over a limit"
+        missed = f"{100.0 * one.excess:.2g} % over a limit"
+        words = "limits met" if one.excess <= EXCESS else missed
         return (
-            f"{number} objective {one.simulated.evaluation.objective:.5g}, "
+            f"{self.steps} objective {one.simulated.evaluation.objective:.5g}, "
             f"mass {one.mass:.4g} kg, {words}, trust region {self.radius:.2g}"
         )
 
@@ -255,8 +228,6 @@ class Search:
                 self.radius *= 0.5
                 continue
             share = tried.fall / tried.promised
-            if share < ACCEPTED and tried.promised < HARDLY * abs(state.values[0]):
-                return False
             if share < POOR or share > GOOD:
                 self.radius = min(LARGEST_RADIUS, self.radius * (0.5 if share < POOR else 2.0))
             if share >= ACCEPTED:
@@ -269,8 +240,7 @@ class Search:
         dual /= abs(state.values[0])
         if dual < 0.5 * self.price:  # a price far above the multipliers makes steps short
             self.price = min(self.price, max(OVER * dual, 0.7 * self.price, LEAST_PRICE))
-        before, after = (one.values[1:].max(initial=0.0) for one in (state, step.state))
-        if after > max(5.0 * EXCESS, FALLS * before):  # it is worth more than it costs now
+        if step.state.excess > max(5.0 * EXCESS, FALLS * state.excess):  # limits cost too little
             self.price *= 2.0
         least = ACTIVE * sum(step.places.values())
         self.priced = {key for key, price in step.places.items() if price > least}
@@ -281,10 +251,7 @@ class Search:
             self.reach = np.clip(factor * self.reach, *BOUNDS)
         self.way = way
         self.before = None if step.anew else (step, linear)
-        self.since += 1
-        self.state = step.state
-        self.passed.append(dict(step.state.outlines))
-        self._keep_met()
+        self.since, self.steps, self.state = self.since + 1, self.steps + 1, step.state
 
     def _learn(self, state: State, keys: list[Place]) -> None:
         """Find the derivatives of the stress at places."""

@@ -244,7 +244,7 @@ def test_flanges_that_would_buckle_are_kept(made):
         problem = Problem(with_tables(soft, constraints=limits), {}, {})
         search = Search(problem, problem.evaluated({0: _free(scene, 0, parts[0])}, {}))
         states = [search.state]
-        search.run(2, lambda line: None, 0)
+        search.run(2, lambda line: None)
         states.append(search.state)
         found[least] = [
             next(limit.value for limit in one.limits if limit.name == "buckling") for one in states

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -28,7 +28,7 @@ from dolfinopt.part.plane.sides import (
     left,
     unit,
 )
-from dolfinopt.part.plane.simpler import simplifications, without_struts
+from dolfinopt.part.plane.simpler import simplifications
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
 MOST = 40  # sides and holes that go at once, at most
@@ -111,12 +111,6 @@ class FreeSides:
                 return made, number
         return made, MOST
 
-    def without_struts(self) -> Iterator[FreeSides]:
-        """Yield it without one of its struts, the thinnest first."""
-        for sides in without_struts(self.sides, self.limits, self.part.domain.outer_edges):
-            if (found := replace(self, sides=sides).nearest()) is not None:
-                yield found[0]
-
     def moved(self, x: np.ndarray) -> FreeSides:
         """Return it after a step x.
 
@@ -130,17 +124,9 @@ class FreeSides:
         found = self.limits.nearest(self.sides)
         return None if found is None else (replace(self, sides=found[0]), found[1])
 
-    def meshed(self, turns: np.ndarray | None = None) -> Mesh:
-        """Return a new mesh of it.
-
-        Args:
-            turns: (n,) of its pieces along a side of the mesh, rad; None: `mesh.TURN`.
-        """
-        if self.solid is not None:
-            return self.current.mesh()
-        if turns is None or len(turns) != len(self.sides.shape.pieces):
-            return self.plane.mesh(finer=())
-        return self.plane.mesh(finer=(), turn=turns)
+    def meshed(self, finer: Sequence[np.ndarray]) -> Mesh:
+        """Return a new mesh of it, see `part.Part.mesh`."""
+        return self.current.mesh(finer=finer)
 
     def followed(self, mesh: Mesh) -> Mesh | None:
         """Return a mesh of sides nearby, moved to these; None where its triangles are spoilt."""

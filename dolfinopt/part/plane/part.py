@@ -188,14 +188,9 @@ class PlanePart:
         yield ".svg", svg_text(shape, title)
         yield ".stl", triangle_bytes(MM * self.facets, f"{title}, mm")
 
-    def mesh(
-        self,
-        coarser: float = 1.0,
-        finer: Sequence[np.ndarray] | None = None,
-        turn: float | np.ndarray = TURN,
-    ) -> BodyMesh:
-        """Return triangles along its curves, see `part.Part`; `turn` as of `body_mesh`."""
-        turn = FINE if finer is None else turn
+    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> BodyMesh:
+        """Return triangles along its curves, see `part.Part`."""
+        turn = FINE if finer is None else TURN
         try:
             return body_mesh(self.shape, self.domain.cell, coarser, finer or (), turn)
         except InputError as error:

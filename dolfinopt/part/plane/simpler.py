@@ -1,9 +1,7 @@
-"""Other layouts of a part: without sides that vanish, holes that close, and struts.
+"""Other layouts of a part: without sides that vanish and holes that close.
 
 A search moves sides until limits of the geometry hold them: a side at its least length, a corner
 at its least turn, a hole at its smallest. Without them the outline is simpler, and free to move on.
-A strut lies between two sides of different holes that face each other; without it both holes are
-one.
 """
 
 from __future__ import annotations
@@ -15,23 +13,14 @@ import numpy as np
 
 from dolfinopt.part.plane.curves import Line, direction
 from dolfinopt.part.plane.fit import Drawn, cleaned, looped
-from dolfinopt.part.plane.limits import SHORT, TURN, Limits, facing
-from dolfinopt.part.plane.sides import (
-    LineMoves,
-    Loop,
-    Side,
-    Sides,
-    angle_of,
-    turn_between,
-    unit,
-)
+from dolfinopt.part.plane.limits import SHORT, TURN, Limits
+from dolfinopt.part.plane.sides import Loop, Side, Sides, angle_of, turn_between, unit
 
 NEARLY = 1.2  # of the least turn, up to which a corner hardly turns
 VANISHING = 2.5  # of the least length, up to which a side vanishes
 # Of a tooth: turn at its tip, and between the sides beside it, at most; length of its sides, cells.
 TIP, FLAT, TOOTH = np.radians(45.0), np.radians(25.0), 4.0
 SMALL = 20.0  # area of a hole that may close, squared cells or tool radii
-SLENDER = 1.6  # width of struts that may go, over the least width of members
 
 
 def without_teeth(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
@@ -85,27 +74,6 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
         if np.pi * ring.radius**2 < least:
             left = [one for one in sides.circles if one.key not in (ring.key, ring.twin)]
             yield replace(sides, circles=tuple(left))
-
-
-def without_struts(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
-    """Yield the outline without one of its thin struts, the thinnest first."""
-    found, done = facing(sides, limits.cell, SLENDER * limits.member), set[frozenset[int]]()
-    for n in np.argsort(found.width):
-        beside = [found.every[k] for k in found.pairs[n]]
-        if not found.members[n] or beside[0].loop == beside[1].loop:
-            continue
-        if not all(isinstance(one.moves, LineMoves) and one.piece.free for one in beside):
-            continue
-        a, b = (sides.loops[one.loop].sides[one.side] for one in beside)
-        keys, twins = {a.key, b.key}, {a.twin, b.twin}
-        if frozenset(keys | twins) in done:
-            continue
-        done.add(frozenset(keys | twins))
-        left = _spliced(sides, a.key, b.key, limits, outer)
-        if left is not None and min(twins) >= 0 and twins != keys and len(twins) == 2:
-            left = _spliced(left, a.twin, b.twin, limits, outer)
-        if left is not None:
-            yield left
 
 
 def _lines(sides: Sides) -> dict[int, tuple[int, int, Line]]:
@@ -188,21 +156,3 @@ def _merged(sides: Sides, a: Side, b: Side, limits: Limits, outer: int) -> Itera
     if a.twin >= 0 and a.twin != a.key:
         new[a.twin] = one.mirrored()
     yield from _without(sides, {b.key, b.twin}, limits, outer, new)
-
-
-def _spliced(sides: Sides, a: int, b: int, limits: Limits, outer: int) -> Sides | None:
-    """Return the outline without the strut between two sides, given by their keys."""
-    lines = _lines(sides)
-    if a not in lines or b not in lines:
-        return None
-    (i, k, _), (j, m, _) = sorted([lines[a], lines[b]], key=lambda one: one[:2])
-    if i == j:
-        return None
-    one, other = _drawn(sides, i), _drawn(sides, j)
-    drawn = [*one[k + 1 :], *one[:k], *other[m + 1 :], *other[:m]]
-    made = _looped(sides, drawn, limits, outer, _radii(sides))
-    if made is None:
-        return None
-    loops = [loop for number, loop in enumerate(sides.loops) if number not in (i, j)]
-    loops.insert(0 if i == 0 else len(loops), made)
-    return replace(sides, loops=tuple(loops))
