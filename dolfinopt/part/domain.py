@@ -457,7 +457,6 @@ class Domain(Filled):
             around the cell; (n,) which cell.
         outline: the arm's own, bores included.
         solid, void: where material stays, and where there is none.
-        grid: numbers of cells (along, across) where they form one.
         length, thickness: m.
         symmetric: about y = 0.
         minimum_member: smallest width of members that the scene asks for, m; 0: none.
@@ -476,7 +475,6 @@ class Domain(Filled):
     outline: Region
     solid: Region
     void: Region
-    grid: tuple[int, int] | None
     length: float
     thickness: float
     symmetric: bool
@@ -547,7 +545,6 @@ def domain_of(
         outline=outline,
         solid=solid,
         void=void,
-        grid=None if entry.cells is None else entry.cells[:2],
         length=entry.length,
         thickness=entry.thickness,
         symmetric=like.symmetric_about[0],

@@ -218,7 +218,7 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
     solid = part.domain if isinstance(part, SolidPart) else None
     cell = flat.domain.cell
     hole = SMALLEST * max(cell, limits.tool) ** 2
-    outline = without_stubs(flat.outline, STUB * cell)
+    outline = without_stubs(flat.outline, limits, STUB * cell)
     sides = flat.sides
     with suppress(InputError):  # where few do not keep the limits, the part's own will do
         sides = fitted_sides(outline, limits, START * cell, sides.shape.area, hole)

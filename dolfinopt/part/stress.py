@@ -230,6 +230,27 @@ def mean_at_corners(
     return CornerStress(fields, A, outer.astype(float), points, corners, vertices, own, shares)
 
 
+def corner_stress(state: DesignState, fields: LoadFields | None = None) -> CornerStress:
+    """Return the stress at the corners of a design's triangles or tetrahedra.
+
+    At a node of the outline the cells with a side there count: others know less of it.
+    """
+    mesh, dim = state.mesh, state.mesh.dim
+    corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
+    count = len(mesh.mesh.geometry.x)
+    sides = np.array(facet_corners(dim, dim + 1))
+    facets = np.sort(corners[:, sides], axis=2) @ count ** np.arange(dim)
+    _, which, number = np.unique(facets, return_inverse=True, return_counts=True)
+    rim = (number == 1)[which.ravel()].reshape(facets.shape)
+    touches = np.zeros(corners.shape, dtype=bool)  # a corner of one of its own outer sides
+    for facet, side in enumerate(sides):
+        touches[np.ix_(rim[:, facet], side)] = True
+    outer = np.zeros(count, dtype=bool)
+    outer[corners[touches]] = True
+    reference = np.vstack([np.zeros(dim), np.eye(dim)])
+    return mean_at_corners(state, fields, reference, touches | ~outer[corners], outer)
+
+
 # -- as a response: what shape optimisation limits ------------------------------------------------
 
 
@@ -276,7 +297,6 @@ class OutlineStress(Stress):
 # -- in the plane: on the outline, away from singular points -----------------------------------
 
 
-TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference triangle
 # From a singular point, in cells of the design: the centre of the design's cell in such a corner,
 # where its stress is known, is as far away.
 CORNER_DISTANCE = np.sqrt(0.5)
@@ -325,28 +345,9 @@ def is_regular_in_plane(shape: Shape, cell: float, places: np.ndarray, margin: f
     return far
 
 
-def corner_stress_in_plane(state: DesignState, fields: LoadFields | None = None) -> CornerStress:
-    """Return the stress of a design in the plane.
-
-    Of a node of the outline the triangles beside the outline count: others know less of it.
-    """
-    mesh = state.mesh
-    corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
-    count = len(mesh.mesh.geometry.x)
-    ends = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]], axis=2) @ [count, 1]
-    _, which, number = np.unique(ends, return_inverse=True, return_counts=True)
-    rim = (number == 1)[which.ravel()].reshape(-1, 3)
-    outer = np.zeros(count, dtype=bool)
-    outer[corners[rim]] = outer[np.roll(corners, -1, axis=1)[rim]] = True
-    return mean_at_corners(
-        state, fields, TRIANGLE, rim.any(axis=1)[:, None] | ~outer[corners], outer
-    )
-
-
 # -- in space: on the surface, away from singular edges ----------------------------------------
 
 
-TETRAHEDRON = np.vstack([np.zeros(3), np.eye(3)])  # of the reference tetrahedron
 # From a singular edge, in cells of the design: the centre of the design's cell in such a corner,
 # where its stress is known, is as far away.
 EDGE_DISTANCE = np.sqrt(0.75)
@@ -396,20 +397,3 @@ def singular_edges(domain: SolidDomain) -> np.ndarray:
     sharp = (turn > REENTRANT_SINE) & (rise > 0.1 * size)
     found = ends[order[pair]][sharp | (kind[one] != kind[other])]
     return np.asarray(points[found])
-
-
-def corner_stress_in_space(state: DesignState, fields: LoadFields | None = None) -> CornerStress:
-    """Return the stress of a design in space, of the cells with a facet there."""
-    mesh = state.mesh
-    corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
-    count = len(mesh.mesh.geometry.x)
-    sides = np.array(facet_corners(3, 4))
-    facets = np.sort(corners[:, sides], axis=2) @ np.array([count * count, count, 1])
-    _, which, number = np.unique(facets, return_inverse=True, return_counts=True)
-    rim = (number == 1)[which.ravel()].reshape(facets.shape)
-    outer = np.zeros(count, dtype=bool)
-    touches = np.zeros(corners.shape, dtype=bool)  # a corner of one of its own outer facets
-    for facet, side in enumerate(sides):
-        touches[np.ix_(rim[:, facet], side)] = True
-    outer[corners[touches]] = True
-    return mean_at_corners(state, fields, TETRAHEDRON, touches | ~outer[corners], outer)

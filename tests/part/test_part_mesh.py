@@ -8,7 +8,7 @@ from runs import TWO_ARM
 from dolfinopt.arms.arm import Arm
 from dolfinopt.part.mesh import body_mesh, triangle_areas
 from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape, Spline
-from dolfinopt.part.stress import corner_stress_in_plane, singular_points
+from dolfinopt.part.stress import corner_stress, singular_points
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import read_scene
 
@@ -111,7 +111,7 @@ def test_stress_at_a_hole_is_that_of_the_book(meshes, tmp_path):
         arm = Arm(one, 0, MPI.COMM_SELF, Profile())
         assert arm.mesh.area.sum() == pytest.approx(strip().area, rel=1e-6)
         arm.state(np.ones(arm.mesh.num_cells))
-        corners, q = corner_stress_in_plane(arm.current), arm.current.load_fields.V.shape[2]
+        corners, q = corner_stress(arm.current), arm.current.load_fields.V.shape[2]
         at_hole = np.linalg.norm(corners.places - [0.5 * LENGTH, 0.0], axis=1) < 1.1 * RADIUS
         stress = np.linalg.norm(corners.A[:, :, q + 4], axis=0)  # of a unit force along the arm
         nominal = 1.0 / ((HEIGHT - 2.0 * RADIUS) * one.arms[0].thickness)

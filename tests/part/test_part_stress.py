@@ -18,8 +18,7 @@ from dolfinopt.part.check import simulate_parts
 from dolfinopt.part.part import make_parts, mesh_parts
 from dolfinopt.part.stress import (
     OutlineStress,
-    corner_stress_in_plane,
-    corner_stress_in_space,
+    corner_stress,
     stress_of_parts,
 )
 from dolfinopt.responses.response import Analysis
@@ -72,13 +71,12 @@ def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
     plane, kind = base != "spatial_arm", "objective.kind=stress"
     told = (f"arms.mesh='{tmp_path}/bar.geo'", *PLANE) if plane else SPACE
     scene = do.load_scene(ROOT / "demos" / f"{base}.toml", (*ROUGHLY, *told, kind))
-    stress = corner_stress_in_plane if plane else corner_stress_in_space
 
     def middle(length: float, places: np.ndarray, margin: float) -> np.ndarray:
         return (places[:, 0] > 0.15 * length) & (places[:, 0] < 0.85 * length)
 
     parts = {
-        k: SimpleNamespace(stress=stress, regular=partial(middle, arm.length))
+        k: SimpleNamespace(stress=corner_stress, regular=partial(middle, arm.length))
         for k, arm in enumerate(scene.arms)  # cells end at twelfths, or fifths
     }
     response = OutlineStress(scene.objective, parts)

@@ -34,11 +34,10 @@ from dolfinopt.part.solid.surface import (
     crossings,
     cut,
     distance_to_faces,
-    eighths,
-    halved,
     nodal_densities,
     outside,
     surface_at,
+    with_centres,
 )
 from dolfinopt.part.workshop_files import MM, solid_text, three_mf_bytes, triangle_bytes
 from dolfinopt.scene.load import scene_from_dict
@@ -405,16 +404,14 @@ def test_smoothing_takes_stairs_away(domain_with):
     """A slanted crisp end of a cavity: less area than the isosurface, at the same volume."""
     domain = domain_with(lambda x, y, z: 1.0 * (hollow(x, y, z) > 0.5))
     part = make_solid_part(domain)
-    points, nodes, values = halved(domain.corners, domain.field)
-    before = outside(cut(points, eighths(nodes), values, part.level))[0]
+    before = outside(cut(*with_centres(domain.corners, domain.field), part.level))[0]
     assert area_of(part.surface.corners) < 0.995 * area_of(before.corners)
 
 
 def test_member_of_one_cell_keeps_its_size(domain_with):
     """A strip along an edge of the box: at one half all but what is rounded off its inner edge."""
     strip = domain_with(lambda x, y, z: 1.0 * ((y > 0.0134) & (z > 0.005)))
-    points, nodes, values = halved(strip.corners, strip.field)
-    surface, _ = outside(cut(points, eighths(nodes), values, 0.5))
+    surface, _ = outside(cut(*with_centres(strip.corners, strip.field), 0.5))
     assert surface.volume == pytest.approx(strip.volume, rel=0.03)
     coarse, _ = outside(cut(*nodal_densities(strip.corners, strip.field), 0.5))
     assert coarse.volume < 0.9 * strip.volume

@@ -58,9 +58,9 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     import shapely
 
     domain, drawn = part.domain, part.outline
-    arm = domain.outline.area_inside(drawn.chord).difference(domain.void.area_inside(drawn.chord))
-    stays = domain.solid.area_inside(drawn.chord).intersection(arm)
-    arm, span = _between_bores(arm, stays, domain.cell)
+    limits = limits_of_part(domain, drawn.tool_radius)
+    stays = limits.stays
+    arm, span = _between_bores(limits.arm, stays, domain.cell)
     fillet = max(FILLET * domain.cell, drawn.tool_radius)
 
     least = SMALLEST_HOLE * domain.cell**2
@@ -88,7 +88,6 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     sharp = polygon(flange, rounds=False)
     found = replace(drawn, polygon=sharp, islands=0, islands_area=0.0, filled=0)
     area = domain.volume * (1.0 + max(excess, 0.0))
-    limits = limits_of_part(domain, drawn.tool_radius)
     try:
         sides = fitted_sides(found, limits, CLOSE * domain.cell, area)
     except InputError as error:

@@ -18,68 +18,10 @@ from scipy.optimize import brentq
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import INBOARD, OUTBOARD, Domain
 from dolfinopt.part.plane.curves import sampled
+from dolfinopt.part.plane.limits import CHORD, Limits
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
-
-
-NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
-SMALLEST_STUB, SPECK = (
-    0.25,
-    8.0,
-)  # area of a stub at least, and of its thicker end at most, squared widths
-QUADRANT = 12  # sides of a quarter of a disc
-SAGITTA = 0.02  # of the polygons in place of the tool's circle, tolerances
-SHALLOW = 0.1  # depth of corners that are left as they are, tolerances
-
-
-def rounded(whole: Geometry, radius: float, chord: float) -> Geometry:
-    """Return the polygons with all that a disc cannot reach from without added to them.
-
-    Elsewhere their sides stay what they are to the bit.
-    """
-    import shapely
-
-    tolerance = chord / CHORD
-    quadrant = max(int(np.ceil(0.25 * np.pi / np.sqrt(2.0 * SAGITTA * tolerance / radius))), 6)
-    closed = whole.buffer(radius, quad_segs=quadrant).buffer(-radius, quad_segs=quadrant)
-    added = shapely.get_parts(closed.difference(whole))
-    # The rounding of numbers, and every corner of the polygon, leave slivers all along.
-    added = added[shapely.area(added) > (SHALLOW * tolerance) ** 2]
-    deep = shapely.area(shapely.buffer(added, -0.5 * SHALLOW * tolerance, quad_segs=2)) > 0.0
-    added = shapely.buffer(added[deep], 0.1 * chord, join_style="mitre")
-    return shapely.union_all([whole, *added])
-
-
-def without_necks(whole: Geometry, width: float, chord: float) -> Geometry:
-    """Return the polygons without what is narrower than a width and joins wider parts."""
-    import shapely
-
-    opened = whole.buffer(-0.5 * width, quad_segs=QUADRANT).buffer(
-        0.5 * width + 0.1 * chord, quad_segs=QUADRANT
-    )
-    pieces = shapely.get_parts(whole.difference(opened))
-    necks = []
-    for piece in pieces[shapely.area(pieces) > 0.01 * width * width]:
-        touched = piece.buffer(chord).intersection(opened)
-        if len(polygons_of(touched)) != 1:  # a corner touches one wider part
-            necks.append(piece.buffer(chord, join_style="mitre"))
-    return whole.difference(shapely.union_all(necks)) if necks else whole
-
-
-def is_kept(ring: Any, arm: Geometry, least: float) -> bool:
-    """Return whether a hole is a bore of the arm or no mere pinhole."""
-    import shapely
-
-    hole = shapely.Polygon(ring)
-    return bool(hole.area > least or not arm.covers(hole.representative_point()))
-
-
-def polygons_of(geometry: Geometry) -> list[Polygon]:
-    """Return the polygons of a geometry, without points and lines."""
-    import shapely
-
-    return [p for p in shapely.get_parts(geometry) if p.geom_type == "Polygon" and p.area > 0.0]
 
 
 SAMPLES = 5  # points of the raster in a cell
@@ -88,6 +30,26 @@ MARGIN = 4  # points beyond the arm on every side
 # Width of the Gaussian, in cells, that turns the steps of a projected design into slopes. A strut
 # of one cell keeps 0.595 of its density in its middle; from 0.75 on it would fall below one half.
 BLUR = 0.6
+AREA = 1e-3  # relative: up to which the level is sought; sides make up for the rest
+LEAP = 0.05  # relative: what sides make up for where a piece joins or leaves at one level
+TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
+# Material along an interface that the design leaves void, in cells: the interface is rigid.
+STRIP = 0.5
+# Width of members that the design has and the level has not, in cells: solid cells that share a
+# corner are joined in the finite elements. Without them a light arm has 12 holes of 17, and the
+# search from there ends 10 % heavier.
+LINK = 0.5
+UNIFORM = 1e-3  # range of a density without outline
+NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
+# Area of a stub at least, and of its thicker end at most, squared widths.
+SMALLEST_STUB, SPECK = 0.25, 8.0
+
+
+def polygons_of(geometry: Geometry) -> list[Polygon]:
+    """Return the polygons of a geometry, without points and lines."""
+    import shapely
+
+    return [p for p in shapely.get_parts(geometry) if p.geom_type == "Polygon" and p.area > 0.0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,11 +65,6 @@ class Raster:
     x: np.ndarray
     y: np.ndarray
     values: np.ndarray
-
-    @property
-    def spacing(self) -> float:
-        """Distance of neighbouring points, m."""
-        return float(max(self.x[1] - self.x[0], self.y[1] - self.y[0]))
 
     def above(self, level: float) -> Geometry:
         """Return the polygons in which the field, linear between its points, exceeds a level."""
@@ -128,9 +85,9 @@ class Raster:
 def rasterise(domain: Domain) -> Raster:
     """Return the arm's `field` as a smooth function.
 
-    On a grid of cells a cubic spline through their values, on others the piecewise cubic, once
-    differentiable interpolant of Clough and Tocher; no slope across the arm's outline, as with the
-    filter. A design that leaps from cell to cell is blurred by a Gaussian of `BLUR` cells.
+    The piecewise cubic, once differentiable interpolant of Clough and Tocher; no slope across the
+    arm's outline, as with the filter. A design that leaps from cell to cell is blurred by a
+    Gaussian of `BLUR` cells.
     """
     low, high = domain.corners.min(axis=(0, 1)), domain.corners.max(axis=(0, 1))
     if domain.symmetric:
@@ -144,7 +101,7 @@ def rasterise(domain: Domain) -> Raster:
     )
     if domain.symmetric:
         y = 0.5 * (y - y[::-1])
-    values = _on_grid(domain, x, y) if domain.grid is not None else _scattered(domain, x, y)
+    values = _interpolated(domain, x, y)
     if domain.crisp:
         from scipy.ndimage import gaussian_filter
 
@@ -154,24 +111,7 @@ def rasterise(domain: Domain) -> Raster:
     return Raster(x, y, values)
 
 
-def _on_grid(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    from scipy.interpolate import RectBivariateSpline
-
-    assert domain.grid is not None
-    low, high = domain.corners.min(axis=(0, 1)), domain.corners.max(axis=(0, 1))
-    size = (high - low) / domain.grid
-    column, row = np.floor((domain.centroid - low) / size).astype(int).T
-    table = np.empty(domain.grid)
-    table[column, row] = domain.field
-    pad = 3
-    along, across = (
-        low[k] + size[k] * (np.arange(-pad, domain.grid[k] + pad) + 0.5) for k in (0, 1)
-    )
-    spline = RectBivariateSpline(along, across, np.pad(table, pad, mode="symmetric"))
-    return spline(x, y).T
-
-
-def _scattered(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _interpolated(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     from scipy.interpolate import CloughTocher2DInterpolator, NearestNDInterpolator
 
     cell = domain.rim_cells
@@ -183,26 +123,10 @@ def _scattered(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     points = np.vstack([domain.centroid, images])
     values = np.append(domain.field, domain.field[cell])
     grid = np.stack(np.meshgrid(x, y), axis=-1)
-    found = CloughTocher2DInterpolator(points, values, rescale=False)(grid)
+    found = CloughTocher2DInterpolator(points, values)(grid)
     outside = np.isnan(found)
     found[outside] = NearestNDInterpolator(points, values)(grid[outside])
     return found
-
-
-AREA = 1e-4  # relative: up to which the level is sought
-NARROW = 2e-4  # of the levels' range: bracket at which the search ends, where the area leaps
-LEAP = 0.05  # relative: what sides make up for where a piece joins or leaves at one level
-CHORD = 0.01  # distance of polygons from the exact curves, of the tolerance
-STRAIGHT = 0.03  # distance of the level's polygon from its corners that are left out, tolerances
-TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
-# Material along an interface that the design leaves void, in cells: the interface is rigid.
-STRIP = 0.5
-# Width of members that the design has and the level has not, in cells: solid cells that share a
-# corner are joined in the finite elements.
-LINK = 0.5
-UNIFORM = 1e-3  # range of a density without outline
-NECK = 3.0  # width of necks that are cut, tolerances: sides on both of them must not meet
-PINHOLE = 0.5  # diameter of holes that are closed whatever the tool, cells
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +138,6 @@ class Outline:
         polygon: shapely's, m; with sides on the arm's own curves where it touches them.
         level: of the field.
         tool_radius: m.
-        chord: distance of its sides from the arm's own curves, m.
         islands, islands_area: number of pieces that join no interface and were dropped; m2.
         filled: number of holes narrower than the tool, closed.
     """
@@ -223,26 +146,24 @@ class Outline:
     polygon: Polygon
     level: float
     tool_radius: float
-    chord: float
-    islands: int
-    islands_area: float
-    filled: int
+    islands: int = 0
+    islands_area: float = 0.0
+    filled: int = 0
 
     @property
     def area(self) -> float:
         """Area within the polygon, m2."""
         return float(self.polygon.area)
 
+    @property
+    def chord(self) -> float:
+        """Distance of its sides from the arm's own curves, m."""
+        return CHORD * self.domain.cell
 
-@dataclass(frozen=True, eq=False)
-class _Given:
-    """What all levels have in common, as shapely's geometries."""
-
-    arm: Geometry  # where material may be
-    stays: Geometry  # where it must be
-    links: Geometry  # along which the design hangs together
-    inboard: Geometry  # lines of the interface
-    outboard: Geometry  # lines of the interface
+    @property
+    def off(self) -> float:
+        """By how much the area differs from the design's volume, relative."""
+        return abs(self.area / self.domain.volume - 1.0)
 
 
 def default_tool(domain: Domain) -> float:
@@ -250,43 +171,55 @@ def default_tool(domain: Domain) -> float:
     return min(TOOL, SLIM * domain.height)
 
 
-def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outline:
+def draw_outline(domain: Domain, limits: Limits) -> Outline:
     """Find the outline whose area is the material's volume over the thickness.
 
     Args:
         domain: the arm.
-        tool_radius: of every concave corner, m.
-        tolerance: of the part, m; the polygon is far closer to the arm's own curves.
+        limits: of its part.
 
     Raises:
         InputError: the tool does not fit into the arm; the design is a checkerboard; no material
             joins the interfaces; what must stay solid is more than the volume.
     """
-    where = f"arm {domain.name!r}"
-    if 2.0 * tool_radius >= domain.height:
+    import shapely
+
+    where, tool, volume = f"arm {domain.name!r}", limits.tool, domain.volume
+    if 2.0 * tool >= domain.height:
         raise InputError(
-            f"--tool-radius = {tool_radius:g} m: the tool is as wide as {where}, which is "
+            f"--tool-radius = {tool:g} m: the tool is as wide as {where}, which is "
             f"{domain.height:g} m high; expected less than {0.5 * domain.height:g} m"
         )
-    given = _given(domain, CHORD * tolerance)
-    target = domain.volume
-    if given.stays.area > target * (1.0 + AREA):
+    stays = _stays(domain, limits)
+    links = shapely.MultiLineString(list(domain.links)).buffer(0.5 * LINK * domain.cell)
+    links = links.intersection(limits.arm)
+    if stays.area > volume * (1.0 + AREA):
         raise InputError(
-            f"{where}: what stays solid has {1e6 * given.stays.area:.6g} mm2, the design "
-            f"{1e6 * target:.6g} mm2; shorten arms.passive or raise design.volume_fraction"
+            f"{where}: what stays solid has {1e6 * stays.area:.6g} mm2, the design "
+            f"{1e6 * volume:.6g} mm2; shorten arms.passive or raise design.volume_fraction"
         )
-
-    if target > given.arm.area * (1.0 - AREA):
-        polygon = max(polygons_of(given.arm), key=lambda p: p.area)
-        return Outline(domain, polygon, 0.0, tool_radius, CHORD * tolerance, 0, 0.0, 0)
+    if volume > limits.arm.area * (1.0 - AREA):
+        return Outline(domain, max(polygons_of(limits.arm), key=lambda p: p.area), 0.0, tool)
     if float(np.ptp(domain.field)) < UNIFORM:
         raise InputError(
             f"{where}: its density is {domain.field.mean():.3g} everywhere, which has no outline; "
             "optimise it first"
         )
+    raster, tried = rasterise(domain), list[Outline]()
 
-    found = _found(domain, given, tool_radius, tolerance)
-    if _off(found) <= LEAP:
+    def excess(level: float) -> float:
+        above = shapely.simplify(raster.above(level), CHORD * domain.cell)
+        whole = shapely.union_all([above.intersection(limits.arm), stays])
+        found = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), level)
+        tried.append(found)
+        return 0.0 if found.off < AREA else found.area - volume
+
+    low, high = float(raster.values.min()), float(raster.values.max())
+    step = 0.02 * (high - low)
+    with suppress(ValueError):  # whatever the level the area is too large, or too small
+        brentq(excess, low - step, high + step, xtol=AREA * (high - low))
+    found = min(tried, key=lambda one: one.off)
+    if found.off <= LEAP:
         return found
     raise InputError(
         f"{where}: the material of the design does not hang together: at no level has the "
@@ -295,98 +228,57 @@ def draw_outline(domain: Domain, tool_radius: float, tolerance: float) -> Outlin
     )
 
 
-def _found(domain: Domain, given: _Given, tool_radius: float, tolerance: float) -> Outline:
-    """Return the outline of the level at which its area is nearest to the design's volume."""
-    raster, tried = rasterise(domain), list[Outline]()
-
-    def excess(level: float) -> float:
-        found = _at(domain, given, raster, level, tool_radius, CHORD * tolerance)
-        tried.append(found)
-        return 0.0 if _off(found) < AREA else found.area - domain.volume
-
-    low, high = float(raster.values.min()), float(raster.values.max())
-    step = 0.02 * (high - low)
-    with suppress(ValueError):  # whatever the level the area is too large, or too small
-        brentq(excess, low - step, high + step, xtol=NARROW * (high - low))
-    return min(tried, key=_off)
-
-
-def _given(domain: Domain, chord: float) -> _Given:
+def _interfaces(domain: Domain) -> list[Geometry]:
+    """Return the lines of both interfaces."""
     import shapely
 
-    arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
-    interfaces = {}
-    for label in (INBOARD, OUTBOARD):
-        curves = [edge.curve for edge in domain.outline.edges if edge.label == label]
-        interfaces[label] = shapely.union_all(
-            [shapely.LineString(np.vstack([sampled([c], chord), c.end])) for c in curves]
+    chord = CHORD * domain.cell
+    return [
+        shapely.union_all(
+            [
+                shapely.LineString(np.vstack([sampled([edge.curve], chord), edge.curve.end]))
+                for edge in domain.outline.edges
+                if edge.label == label
+            ]
         )
-    strips = [one.buffer(STRIP * domain.cell) for one in interfaces.values()]
-    stays = shapely.union_all([domain.solid.area_inside(chord), *strips]).intersection(arm)
-    links = shapely.MultiLineString(list(domain.links)).buffer(
-        0.5 * LINK * domain.cell, quad_segs=4
-    )
-    return _Given(arm, stays, links.intersection(arm), interfaces[INBOARD], interfaces[OUTBOARD])
+        for label in (INBOARD, OUTBOARD)
+    ]
 
 
-def _material(given: _Given, raster: Raster, level: float, straight: float) -> Geometry:
-    """Return what is solid at a level, before a tool has been there."""
-    # Without corners nearer to the level's outline than `straight` (m).
+def _stays(domain: Domain, limits: Limits) -> Geometry:
+    """Return where material must be, strips along the interfaces among it."""
     import shapely
 
-    above = shapely.simplify(raster.above(level), straight)
-    whole = shapely.union_all([above.intersection(given.arm), given.stays])
-    whole = shapely.union_all(polygons_of(whole))  # without points and lines
-    missing = shapely.get_parts(given.links.difference(whole))
-    near = 1e-3 * straight
-    joints = shapely.buffer(shapely.intersection(shapely.buffer(missing, near), whole), near)
-    # What touches the material in one place alone joins nothing.
-    joins = [len(polygons_of(one)) > 1 for one in joints]
-    return shapely.union_all([whole, *shapely.buffer(missing[joins], near)])
+    strips = [one.buffer(STRIP * domain.cell) for one in _interfaces(domain)]
+    return shapely.union_all([limits.stays, *strips]).intersection(limits.arm)
 
 
-def _at(
-    domain: Domain,
-    given: _Given,
-    raster: Raster,
-    level: float,
-    tool: float,
-    chord: float,
-) -> Outline:
-    """Return the outline at a level."""
+def _linked(whole: Geometry, links: Geometry, near: float) -> Geometry:
+    """Return material with the links that join it in two places or more."""
     import shapely
 
-    whole = _material(given, raster, level, STRAIGHT * chord / CHORD)
+    missing = shapely.buffer(shapely.get_parts(links.difference(whole)), near)
+    joins = [len(polygons_of(one)) > 1 for one in shapely.intersection(missing, whole)]
+    return shapely.union_all([whole, *missing[joins]])
+
+
+def _at(domain: Domain, limits: Limits, whole: Geometry, level: float) -> Outline:
+    """Return the outline at a level of what is above it."""
+    import shapely
+
     before = polygons_of(whole)
-    if tool > 0.0:
-        whole = rounded(whole, tool, chord).intersection(given.arm)
-    whole = without_necks(whole, NECK * chord / CHORD, chord)
-    parts = polygons_of(whole)
-    near = 1e-6 * domain.extent
-    kept = [p for p in parts if all(p.distance(i) < near for i in (given.inboard, given.outboard))]
-    main = max(kept, key=lambda p: p.area) if kept else shapely.Polygon()
-    pinhole = 0.25 * np.pi * (PINHOLE * domain.cell) ** 2
-    holes = [ring for ring in main.interiors if is_kept(ring, given.arm, pinhole)]
+    closed = shapely.union_all(before).buffer(limits.tool).buffer(-limits.tool)
+    parts = polygons_of(shapely.union_all([*before, closed]).intersection(limits.arm))
+    near, ends = 1e-6 * domain.extent, _interfaces(domain)
+    joined = [p for p in parts if all(p.distance(one) < near for one in ends)]
+    main = max(joined, key=lambda p: p.area, default=shapely.Polygon())
     dropped = [p for p in parts if p is not main]
-    closed = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in dropped)
-    return Outline(
-        domain=domain,
-        polygon=shapely.Polygon(main.exterior, holes) if kept else main,
-        level=level,
-        tool_radius=tool,
-        chord=chord,
-        islands=len(dropped),
-        islands_area=float(sum(p.area for p in dropped)),
-        filled=max(closed - len(holes), 0),
-    )
+    holes = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in parts)
+    area = float(sum(p.area for p in dropped))
+    return Outline(domain, main, level, limits.tool, len(dropped), area, max(holes, 0))
 
 
-def _off(outline: Outline) -> float:
-    """Return by how much the area differs from the volume, relative."""
-    return abs(outline.area / outline.domain.volume - 1.0)
-
-
-def without_stubs(outline: Outline, width: float) -> Outline:
+def without_stubs(outline: Outline, limits: Limits, width: float) -> Outline:
     """Return an outline without members narrower than `width`, m, that end nowhere.
 
     A narrow piece stays where it joins two places of what is wider, or lies in what must stay.
@@ -394,8 +286,8 @@ def without_stubs(outline: Outline, width: float) -> Outline:
     import shapely
 
     polygon, near = outline.polygon, NEAR_STUB * width
-    stays = _given(outline.domain, outline.chord).stays.intersection(polygon)
-    wide = polygon.buffer(-0.5 * width).buffer(0.5 * width, quad_segs=QUADRANT)
+    stays = _stays(outline.domain, limits).intersection(polygon)
+    wide = polygon.buffer(-0.5 * width).buffer(0.5 * width)
     cores = polygons_of(wide)
     narrow = polygons_of(polygon.difference(wide.buffer(near)))
     members = [one.buffer(2.0 * near) for one in narrow if one.area > SMALLEST_STUB * width**2]

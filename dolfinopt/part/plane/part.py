@@ -20,7 +20,7 @@ from dolfinopt.part.plane.fit import distance, fitted_sides
 from dolfinopt.part.plane.limits import THIN, limits_of_part, rounded_radii, thinnest_member
 from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
 from dolfinopt.part.plane.sides import Sides
-from dolfinopt.part.stress import corner_stress_in_plane, is_regular_in_plane
+from dolfinopt.part.stress import corner_stress, is_regular_in_plane
 from dolfinopt.part.workshop_files import (
     MM,
     dxf_text,
@@ -202,7 +202,7 @@ class PlanePart:
 
     def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the triangles of its arm."""
-        return corner_stress_in_plane(state, fields)
+        return corner_stress(state, fields)
 
 
 def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
@@ -232,7 +232,8 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
         )
     tool = default_tool(domain) if curves.tool_radius is None else curves.tool_radius
     fine = min(away, TOLERANCE, CELLS * domain.cell)
-    outline, limits = draw_outline(domain, tool, fine), limits_of_part(domain, tool)
+    limits = limits_of_part(domain, tool)
+    outline = draw_outline(domain, limits)
     sides = fitted_sides(outline, limits, away, domain.volume)
     if curves.rounds:
         sides = rounded_radii(sides, limits)

@@ -32,7 +32,7 @@ from dolfinopt.part.solid.surface import (
     with_volume,
 )
 from dolfinopt.part.solid.widths import Widths, measured_widths
-from dolfinopt.part.stress import corner_stress_in_space, is_regular_in_space
+from dolfinopt.part.stress import corner_stress, is_regular_in_space
 from dolfinopt.part.workshop_files import MM, dxf_text, solid_text, three_mf_bytes, triangle_bytes
 
 if TYPE_CHECKING:
@@ -236,7 +236,7 @@ class SolidPart:
 
     def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the tetrahedra of its arm."""
-        return corner_stress_in_space(state, fields)
+        return corner_stress(state, fields)
 
 
 def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart:
