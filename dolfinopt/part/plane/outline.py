@@ -39,6 +39,7 @@ STRIP = 0.5
 # corner are joined in the finite elements. Without them a light arm has 12 holes of 17, and the
 # search from there ends 10 % heavier.
 LINK = 0.5
+NECK = 0.3  # width of necks that are cut, cells: a rod with them cannot be simulated
 UNIFORM = 1e-3  # range of a density without outline
 NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
 # Area of a stub at least, and of its thicker end at most, squared widths.
@@ -262,13 +263,26 @@ def _linked(whole: Geometry, links: Geometry, near: float) -> Geometry:
     return shapely.union_all([whole, *missing[joins]])
 
 
+def _without_necks(whole: Geometry, width: float, near: float) -> Geometry:
+    """Return material without what is narrower than a width, m, and joins wider parts."""
+    import shapely
+
+    opened = whole.buffer(-0.5 * width).buffer(0.5 * width + near)
+    pieces = shapely.get_parts(whole.difference(opened))
+    pieces = shapely.buffer(pieces[shapely.area(pieces) > 0.01 * width**2], 3.0 * near)
+    # A corner touches one wider part.
+    necks = [len(polygons_of(one)) != 1 for one in shapely.intersection(pieces, opened)]
+    return whole.difference(shapely.union_all(pieces[necks]))
+
+
 def _at(domain: Domain, limits: Limits, whole: Geometry, level: float) -> Outline:
     """Return the outline at a level of what is above it."""
     import shapely
 
     before = polygons_of(whole)
     closed = shapely.union_all(before).buffer(limits.tool).buffer(-limits.tool)
-    parts = polygons_of(shapely.union_all([*before, closed]).intersection(limits.arm))
+    filled = shapely.union_all([*before, closed]).intersection(limits.arm)
+    parts = polygons_of(_without_necks(filled, NECK * domain.cell, CHORD * domain.cell))
     near, ends = 1e-6 * domain.extent, _interfaces(domain)
     joined = [p for p in parts if all(p.distance(one) < near for one in ends)]
     main = max(joined, key=lambda p: p.area, default=shapely.Polygon())
