@@ -16,7 +16,7 @@ from dolfinopt.part.part import Part, PartMesh
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.stress import HOT, OutlineStress
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
+from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient
 from dolfinopt.responses.products import by_nodes
 from dolfinopt.responses.response import Analysis, objective_of

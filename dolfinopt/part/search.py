@@ -19,7 +19,7 @@ import numpy as np
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.sides import BrokenError
-from dolfinopt.part.problem import Place, Problem, State
+from dolfinopt.part.problem import NEAR, Place, Problem, State
 from dolfinopt.part.program import solve
 from dolfinopt.responses.constraints import EXCESS
 
@@ -27,7 +27,7 @@ FAR = 0.6  # cells that a side's end, or a radius, moves in a step, at most
 FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.5, 2.0, 0.005  # of the trust region, of FAR
 FOLLOWED = 6  # steps that a mesh follows
 SETTLED = 1e-2  # relative fall of the objective on two new meshes that ends the search
-HOT, MOST, OLD = -0.15, 6, 5  # places: from this value on, so many a step, steps that rows hold
+MOST, OLD = 6, 5  # places that are differentiated in a step; steps that their rows hold
 ACTIVE = 0.01  # of all multipliers of places: that of one whose row is found anew in each step
 ATTEMPTS = 3  # at a step of one radius
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
@@ -217,7 +217,7 @@ class Search:
             for key, row in self.rows.items()
             if key in places and len(row[0]) == slopes.shape[1] and self.steps - row[1] <= OLD
         }
-        hottest = sorted((k for k in places if places[k] > HOT), key=lambda k: -places[k])
+        hottest = sorted((k for k in places if places[k] > NEAR), key=lambda k: -places[k])
         stale = [k for k in hottest if k not in self.rows or k in self.priced]
         self._learn(state, stale[:MOST])
         self._curved(slopes)

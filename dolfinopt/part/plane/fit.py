@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count as counting
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -36,9 +36,6 @@ from dolfinopt.part.plane.sides import (
     unit,
 )
 
-if TYPE_CHECKING:
-    from shapely import Geometry
-
 MIDDLE = 0.7  # share of a portion that its line is fitted to
 LEAST = 0.3  # length of a side that is worth drawing, cells
 SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
@@ -47,10 +44,8 @@ ATTEMPTS, COARSER = (1.0, 0.6, 0.35), (0.2, 2.0, 4.0)  # shares of the tolerance
 SAME_AREA = 1e-3  # relative
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
-CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
 STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
 SMALL = 0.05  # least radius of a fillet, cells: of a tool without radius
-LEAVING = 1.2 * TURN  # between a line and a circle that stays solid, at least
 ROOM = 0.45  # share of a side that a fillet at one of its ends may take
 
 
@@ -255,8 +250,7 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
             drawn = [one for run in chain for one in _sides_along(run, edges, tolerance, closed)]
             drawn = _distinct([one.named(key=next(names)) for one in drawn], halved)
             drawn = _whole(drawn, names) if halved else drawn
-            drawn = cleaned(_leaving(drawn, outer), limits)
-            drawn = _leaving(cornered(drawn, limits, boundary, tolerance), outer)
+            drawn = cleaned(drawn, limits)
             if not drawn:
                 continue
             if _is_circle(drawn):
@@ -439,36 +433,6 @@ def _crossing(one: Drawn) -> Drawn:
     )
 
 
-def _leaving(drawn: Sequence[Drawn], outer: int) -> list[Drawn]:
-    """Return sides whose lines leave circles that stay solid in a corner that can be rounded.
-
-    A tangent has no corner there, and one that turns the other way would cut into the circle: it
-    is moved inwards until it leaves the circle at a little more than the least turn.
-    """
-    made, count = list(drawn), len(drawn)
-    for k, one in enumerate(drawn):
-        along = unit(one.side.angle)
-        out, touched = -left(along), []
-        for j, sense in (((k - 1) % count, 1.0), ((k + 1) % count, -1.0)):
-            arc = drawn[j].side.curve
-            if one.side.free and drawn[j].side.edge >= outer and isinstance(arc, Arc):
-                height = float((one.side.point - arc.centre) @ out)
-                above = height - arc.radius * np.cos(LEAVING)
-                if arc.sweep > 0.0 and 0.0 < above < arc.radius:
-                    touched.append((j, sense, arc, height, above))
-        if not touched:
-            continue
-        drop = max(above for *_, above in touched)
-        made[k] = replace(made[k], side=one.side.moved(-drop, 0.0))
-        for j, sense, arc, height, _ in touched:
-            reach = float(np.sqrt(arc.radius**2 - (height - drop) ** 2))
-            place = arc.centre + (height - drop) * out + sense * reach * along
-            ends = ("start", "end") if sense > 0.0 else ("end", "start")
-            made[k] = replace(made[k], **{ends[0]: place})
-            made[j] = replace(made[j], **{ends[1]: place})
-    return made
-
-
 # -- corners --------------------------------------------------------------------------------------
 
 
@@ -508,71 +472,6 @@ def cleaned(drawn: Sequence[Drawn], limits: Limits) -> list[Drawn]:
         gone = drawn[k].names
         drawn = _distinct([one for one in drawn if not one.names & gone])
     return []
-
-
-def cornered(
-    drawn: list[Drawn], limits: Limits, boundary: Geometry, tolerance: float
-) -> list[Drawn]:
-    """Return sides without those in whose place a corner of their neighbours, rounded, will do.
-
-    Args:
-        drawn: the sides of a loop.
-        limits: of the part.
-        boundary: of the outline's polygon (shapely).
-        tolerance: distance from it up to which a corner will do, m.
-    """
-    done: set[int] = set()
-    while True:
-        order = sorted(drawn, key=lambda one: float(np.linalg.norm(one.end - one.start)))
-        found = next(
-            (
-                one
-                for one in order
-                if one.side.free
-                and one.side.key not in done
-                and len(drawn) > 2 + len(one.names)
-                and _corner_will_do(drawn, drawn.index(one), limits, boundary, tolerance)
-            ),
-            None,
-        )
-        if found is None:
-            return drawn
-        done |= found.names
-        left = cleaned([one for one in drawn if not one.names & found.names], limits)
-        drawn = left or drawn
-
-
-def _corner_will_do(
-    drawn: Sequence[Drawn], k: int, limits: Limits, boundary: Geometry, tolerance: float
-) -> bool:
-    """Return whether the sides beside side k meet near the outline, with a fillet that fits."""
-    import shapely
-
-    before, one, after = drawn[k - 1], drawn[k], drawn[(k + 1) % len(drawn)]
-    if one.side.key == one.side.twin and not {before.side.key, after.side.key} - one.names:
-        return False
-    try:
-        place = meet(before.side, after.side, 0.0, 0.5 * (one.start + one.end))
-    except BrokenError:
-        return False
-    a, b = before.side.foot(place)[1], after.side.foot(place)[1]
-    turn = turn_between(a, b)
-    ends = np.linalg.norm(one.start - place), np.linalg.norm(one.end - place)
-    if abs(turn) > CORNER or max(ends) > REACH * limits.cell:
-        return False
-    gap = float(shapely.distance(shapely.Point(place), boundary))
-    if turn > 0.0:
-        return gap <= tolerance
-    half = min(-turn / 2.0, STEEP)
-    radius = max(gap / (1.0 / np.cos(half) - 1.0), limits.tool) if half > 0.0 else np.inf
-    lengths = (np.linalg.norm(place - before.start), np.linalg.norm(after.end - place))
-    if radius * np.tan(half) > ROOM * min(lengths):
-        return False
-    out = -left(a) - left(b)
-    centre = place + radius / np.cos(half) * out / np.linalg.norm(out)
-    begin = angle_of(left(a))
-    arc = Arc(centre, radius, begin, turn).at(np.linspace(0.0, 1.0, 7))
-    return bool(shapely.distance(shapely.points(arc), boundary).max() <= tolerance)
 
 
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:

@@ -19,14 +19,16 @@ from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.checks import cell_sizes, facet_corners
-from dolfinopt.part.domain import AROUND, SolidDomain
+from dolfinopt.mesh.checks import cell_sizes
+from dolfinopt.part.domain import SolidDomain
 
 BELOW = 0.98  # the highest level, over the highest density
 APART = 0.005  # least difference of a node's density from the level
-# Corners of a cell, from a tensor product's order to VTK's, and those of a left-handed one.
-TO_VTK = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
+# Corners of a hexahedron, from a tensor product's order to VTK's.
+AROUND = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
+
 MIRRORED = {4: [0, 2, 1, 3], 8: [4, 5, 6, 7, 0, 1, 2, 3]}
+MIRRORED[27] = [*range(18, 27), *range(9, 18), *range(9)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,44 +109,101 @@ def nodal_densities(
     return points, nodes, total / weight
 
 
-def with_centres(
-    corners: np.ndarray, density: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what `nodal_densities` does of tetrahedra, 24 in every hexahedron.
+def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what `nodal_densities` does of hexahedra cut in eight, 27 points in each.
 
-    Each has an edge, the centre of a face, and that of the cell, where its own density counts
-    alone: a member as thick as one cell stays so. Neighbours cut a face they share alike, however
-    they are turned, as VTK's ways to clip hexahedra do not.
+    At a cell's centre its own density counts alone: a member as thick as one cell stays so.
 
     Args:
         corners: (n, 8, 3) m, common ones the same to the last bit.
         density: (n,) of the cells.
+
+    Returns:
+        Points (m, 3); nodes (n, 27) of every cell as a tensor product; densities (m,).
     """
-    faces = np.array(facet_corners(3, 8))
-    middles, centres = centres_of(corners[:, faces]), corners.mean(axis=1, keepdims=True)
-    points, nodes = _numbers(np.concatenate([corners, middles, centres], axis=1))
+    grid = corners.reshape(-1, 2, 2, 2, 3)
+    for axis in (1, 2, 3):
+        first, last = np.split(grid, 2, axis=axis)
+        # Sums of the same two numbers, whichever comes first: halves of common edges are common.
+        grid = np.concatenate([first, 0.5 * (first + last), last], axis=axis)
+    for axis in (1, 2, 3):
+        _centre_faces(grid, corners, axis)
+    points, nodes = _numbers(grid.reshape(-1, 27, 3))
+    nodes = np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[27]], nodes)
     sizes = cell_sizes(corners)
     weight, total = (
-        np.bincount(nodes.ravel(), np.repeat(one, 15), len(points))
+        np.bincount(nodes.ravel(), np.repeat(one, 27), len(points))
         for one in (sizes, sizes * density)
     )
-    ends = np.stack([faces[:, AROUND], np.roll(faces[:, AROUND], -1, axis=1)], axis=2)
-    rows = [(14, 8 + k, a, b) for k, face in enumerate(ends.tolist()) for a, b in face]
-    return points, nodes[:, np.array(rows)].reshape(-1, 4), total / weight
+    return points, nodes, total / weight
 
 
-def centres_of(faces: np.ndarray) -> np.ndarray:
-    """Return the centres (..., 3) of faces (..., 4, 3) as a tensor product, m."""
-    # The same to the last bit for both of the cells, however they are turned.
-    a, b, c, d = np.moveaxis(faces, -2, 0)
-    return 0.25 * ((a + d) + (b + c))
+def middles(faces: np.ndarray) -> np.ndarray:
+    """Return the nine points (n, 9, 3) of `halved` on faces (n, 4, 3), corners around them, m."""
+    a, b, c, d = faces.swapaxes(0, 1)
+    ends = [0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + d), 0.5 * (d + a)]
+    return np.stack([a, b, c, d, *ends, 0.25 * ((a + c) + (b + d))], axis=1)
+
+
+def eighths(nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes (8 n, 8) of the cells that `halved` made of nodes (n, 27)."""
+    grid = nodes.reshape(-1, 3, 3, 3)
+    parts = [
+        grid[:, z : z + 2, y : y + 2, x : x + 2].reshape(-1, 8)
+        for z in (0, 1) for y in (0, 1) for x in (0, 1)
+    ]  # fmt: skip
+    return np.stack(parts, axis=1).reshape(-1, 8)
+
+
+def forty_eighths(nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes (48 n, 4) of the tetrahedra that `halved` can be cut in, from (n, 27).
+
+    Each has the centre of the cell, of a face, of an edge, and a corner. Neighbours cut a face they
+    share alike, however they are turned, as VTK's ways to clip hexahedra do not.
+    """
+    return nodes[:, FORTY_EIGHTHS].reshape(-1, 4)
+
+
+def _forty_eighths() -> np.ndarray:
+    """Return the rows (48, 4) of `forty_eighths`, of positive volume."""
+    places = np.array([[x, y, z] for z in (0, 1, 2) for y in (0, 1, 2) for x in (0, 1, 2)])
+    found = []
+    odd = (places != 1).sum(axis=1)  # of a corner 3, of an edge 2, of a face 1, of the centre 0
+    for face in np.flatnonzero(odd == 1):
+        for edge in np.flatnonzero(odd == 2):
+            for corner in np.flatnonzero(odd == 3):
+                steps = places[[face, edge, corner]] - 1
+                if ((steps[0] == 0) | (steps[0] == steps[1])).all() and (
+                    (steps[1] == 0) | (steps[1] == steps[2])
+                ).all():
+                    turned = np.linalg.det(steps) < 0.0
+                    found.append([13, face, *((corner, edge) if turned else (edge, corner))])
+    return np.array(found)
+
+
+FORTY_EIGHTHS = _forty_eighths()
+
+
+def _centre_faces(grid: np.ndarray, corners: np.ndarray, axis: int) -> None:
+    """Put the centres of the faces across an axis where both of their cells have them."""
+    cube = corners.reshape(-1, 2, 2, 2, 3)
+    for place, side in ((0, 0), (2, 1)):
+        face = np.take(cube, side, axis=axis)
+        middle = 0.25 * ((face[:, 0, 0] + face[:, 1, 1]) + (face[:, 0, 1] + face[:, 1, 0]))
+        at: list[slice | int] = [slice(None), 1, 1, 1]
+        at[axis] = place
+        grid[tuple(at)] = middle
 
 
 def _right_handed(corners: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return the nodes of cells, those of left-handed ones in another order."""
+    return np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[nodes.shape[1]]], nodes)
+
+
+def _left_handed(corners: np.ndarray) -> np.ndarray:
+    """Tell which cells (n, 4 or 8, 3) are left-handed."""
     edges = corners[:, [1, 2, 3 if corners.shape[1] == 4 else 4]] - corners[:, :1]
-    turned = np.linalg.det(edges) < 0.0
-    return np.where(turned[:, None], nodes[:, MIRRORED[nodes.shape[1]]], nodes)
+    return np.asarray(np.linalg.det(edges) < 0.0)
 
 
 def _cut(
@@ -179,7 +238,7 @@ def cut(
 
     count = nodes.shape[1]
     kind = pyvista.CellType.TETRA if count == 4 else pyvista.CellType.HEXAHEDRON
-    grid = pyvista.UnstructuredGrid({kind: nodes[:, TO_VTK[count]]}, points)
+    grid = pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
     # Through a node or next to it triangles would have no size, and corners fall together.
     grid.point_data["density"] = np.where(np.abs(values - level) < APART, level + APART, values)
     for name, field_values in (fields or {}).items():
@@ -447,7 +506,9 @@ def _passes(start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarr
 
 FINE, NEAR = 1e-6, 1e-3  # of the level; relative difference of volumes that will do
 WHOLE = 1.0 - 1e-9  # of a mark that points between two marked nodes have, but for rounding
-FEW = 20_000  # cells up to which their centres count; of finer ones nodes tell enough
+FEW = (
+    20_000  # cells up to which they are halved for the isosurface; of finer ones nodes tell enough
+)
 MARKS = ("own", "inboard", "outboard")
 FURTHER = "further "  # before the names of the marks of further interfaces
 
@@ -475,16 +536,17 @@ def _field(domain: SolidDomain) -> _Field:
     corners, density = domain.corners, domain.field
     faces = {name: getattr(domain, name) for name in MARKS}
     faces |= {FURTHER + name: one for name, one in domain.further.items()}
-    if corners.shape[1] == 8 and (len(corners) <= FEW or not domain.is_box):
-        points, cells, values = with_centres(corners, density)
-        centres = {name: centres_of(one[:, AROUND])[:, None] for name, one in faces.items()}
-        faces = {name: np.hstack([one, centres[name]]) for name, one in faces.items()}
+    is_box = domain.is_box
+    if corners.shape[1] == 8 and (len(corners) <= FEW or not is_box):
+        points, nodes, values = halved(corners, density)
+        cells = eighths(nodes) if is_box else forty_eighths(nodes)
+        faces = {name: middles(one) for name, one in faces.items()}
     else:
-        points, cells, values = nodal_densities(corners, density)
+        points, nodes, values = nodal_densities(corners, density)
+        cells = nodes
     marks = {name: _among(points, one) for name, one in faces.items()}
     marks["stays"] = np.zeros(len(points))
-    stays = cells.reshape(len(corners), -1)[domain.passive]
-    marks["stays"][stays] = 1.0
+    marks["stays"][nodes[domain.passive]] = 1.0
     values[(marks["inboard"] > 0.0) | (marks["outboard"] > 0.0)] = values.max()
     return _Field(points, cells, values, marks)
 
