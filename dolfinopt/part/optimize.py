@@ -36,7 +36,7 @@ from dolfinopt.scene.load import Scene
 
 ITERATIONS = 80  # default, at most, from every start
 REPAIRS = 3  # times that limits missed in the end are met by further steps
-START = 1.7  # distance of the first sides from the densities' outline, cells
+START = 1.2  # distance of the first sides from the densities' outline, cells
 # Width of members that go where they end nowhere, cells: else the rod misses its stress by 45 %.
 STUB = 1.5
 SMALLEST = 3.0  # area of a hole that a search begins with, squared cells

@@ -19,7 +19,6 @@ from dolfinopt.part.plane.curves import (
     direction,
     sampled,
 )
-from dolfinopt.part.plane.outline import draw_outline
 from dolfinopt.part.plane.part import make_part
 
 pytestmark = pytest.mark.serial
@@ -98,7 +97,7 @@ def test_designs_and_tools_that_are_refused(design):
     with pytest.raises(InputError, match=r"arm 'arm1'.*does not hang together"):
         make_part(design(lambda x, y: np.abs(x - 0.5) > 0.05))
     with pytest.raises(InputError, match=r"--tool-radius = 0.03 m: the tool is as wide as"):
-        draw_outline(design(frame), 0.03, 1e-4)
+        make_part(design(frame), Curves(0.03))
 
 
 def test_full_arm_is_its_own_outline(design):

@@ -44,6 +44,7 @@ ATTEMPTS, COARSER = (1.0, 0.6, 0.35), (0.2, 2.0, 4.0)  # shares of the tolerance
 SAME_AREA = 1e-3  # relative
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
+CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
 STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
 SMALL = 0.05  # least radius of a fillet, cells: of a tool without radius
 ROOM = 0.45  # share of a side that a fillet at one of its ends may take
@@ -71,6 +72,9 @@ class Drawn:
         key = self.side.key if key < 0 else key
         twin = self.side.twin if twin < 0 else twin
         return replace(self, side=replace(self.side, key=key, twin=twin))
+
+
+Gap = Callable[[np.ndarray], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,10 +233,12 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
     ]
     outer, boundary = domain.outer_edges, outline.polygon.boundary
 
+    def gap(place: np.ndarray) -> float:
+        return float(shapely.distance(shapely.Point(place), boundary))
+
     def as_wide(_: int, place: np.ndarray, half: float) -> float:
         """Return the radius of a fillet that touches the outline."""
-        gap = float(shapely.distance(shapely.Point(place), boundary))
-        return gap / (1.0 / np.cos(half) - 1.0)
+        return gap(place) / (1.0 / np.cos(half) - 1.0)
 
     loops: list[Loop] = []
     circles: list[Circle] = []
@@ -250,7 +256,7 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
             drawn = [one for run in chain for one in _sides_along(run, edges, tolerance, closed)]
             drawn = _distinct([one.named(key=next(names)) for one in drawn], halved)
             drawn = _whole(drawn, names) if halved else drawn
-            drawn = cleaned(drawn, limits)
+            drawn = cornered(cleaned(drawn, limits), limits, gap, tolerance)
             if not drawn:
                 continue
             if _is_circle(drawn):
@@ -472,6 +478,47 @@ def cleaned(drawn: Sequence[Drawn], limits: Limits) -> list[Drawn]:
         gone = drawn[k].names
         drawn = _distinct([one for one in drawn if not one.names & gone])
     return []
+
+
+def cornered(drawn: list[Drawn], limits: Limits, gap: Gap, tolerance: float) -> list[Drawn]:
+    """Return sides without short ones in whose place a corner of their neighbours will do.
+
+    Args:
+        drawn: the sides of a loop.
+        limits: of the part.
+        gap: distance of a place from the outline, m.
+        tolerance: distance from it up to which a sharp corner will do, m.
+    """
+    for one in sorted(drawn, key=lambda one: float(np.linalg.norm(one.end - one.start))):
+        names = [other.names for other in drawn]
+        if one.names in names and one.side.free and len(drawn) > 2 + len(one.names):
+            if _corner_will_do(drawn, names.index(one.names), limits, gap, tolerance):
+                left = cleaned([other for other in drawn if not other.names & one.names], limits)
+                drawn = left or drawn
+    return drawn
+
+
+def _corner_will_do(
+    drawn: Sequence[Drawn], k: int, limits: Limits, gap: Gap, tolerance: float
+) -> bool:
+    """Return whether the sides beside side k meet near the outline, with a fillet that fits."""
+    before, one, after = drawn[k - 1], drawn[k], drawn[(k + 1) % len(drawn)]
+    if one.side.key == one.side.twin and not {before.side.key, after.side.key} - one.names:
+        return False
+    try:
+        place = meet(before.side, after.side, 0.0, 0.5 * (one.start + one.end))
+    except BrokenError:
+        return False
+    turn = turn_between(before.side.foot(place)[1], after.side.foot(place)[1])
+    ends = np.linalg.norm(one.start - place), np.linalg.norm(one.end - place)
+    if abs(turn) > CORNER or max(ends) > REACH * limits.cell:
+        return False
+    if turn > 0.0:
+        return gap(place) <= tolerance
+    half = np.clip(-turn / 2.0, 0.5 * TURN, STEEP)
+    radius = max(gap(place) / (1.0 / np.cos(half) - 1.0), limits.tool)
+    room = min(np.linalg.norm(place - before.start), np.linalg.norm(after.end - place))
+    return bool(radius * np.tan(half) <= ROOM * room)
 
 
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:

@@ -76,8 +76,9 @@ def _narrowest(
     a, b, c = surface.corners.swapaxes(0, 1)
     normal = np.cross(b - a, c - a)
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
-    t, place, inside, part, cell = mutable(0.0), [0.0] * 3, [0.0] * 3, mutable(0), mutable(0)
-    hit: tuple[Any, ...] = (0.0, t, place, inside, part, cell)
+    t: Any = mutable(0.0)
+    cell: Any = mutable(0)
+    hit: tuple[Any, ...] = (0.0, t, [0.0] * 3, [0.0] * 3, mutable(0), cell)
     first, last = reach
     found = []
     for start, way in zip(points, along, strict=True):
