@@ -102,7 +102,7 @@ def recognise(points: np.ndarray, labels: np.ndarray, extent: float) -> list[Edg
         edges.append(Edge(curve, str(labels[i])))
         spans.append((i, i + j))
         i += j
-    return _closed(_smoothed(points, halt, edges, spans), near)
+    return _smoothed(points, halt, edges, spans)
 
 
 def _longest(points: np.ndarray, near: float) -> tuple[int, Curve]:
@@ -192,22 +192,6 @@ def _through(points: np.ndarray) -> Spline:
     # Not-a-knot ends; its second derivative is free there.
     spline = make_interp_spline(t / t[-1], points, k=DEGREE)
     return Spline(spline.t, spline.c)
-
-
-def _closed(edges: list[Edge], near: float) -> list[Edge]:
-    """Join first and last curve where one goes on as the other: the polygon began within it."""
-    if len(edges) < 2 or edges[0].label != edges[-1].label:
-        return edges
-    first, last = edges[0].curve, edges[-1].curve
-    if isinstance(first, Line) and isinstance(last, Line):
-        if _straight(np.array([last.start, first.start, first.end]), near):
-            return [Edge(Line(last.start, first.end), edges[0].label), *edges[1:-1]]
-    if isinstance(first, Arc) and isinstance(last, Arc):
-        apart = np.linalg.norm(first.centre - last.centre) + abs(first.radius - last.radius)
-        if apart < 10.0 * near and first.sweep * last.sweep > 0.0:
-            whole = Arc(last.centre, last.radius, last.begin, last.sweep + first.sweep)
-            return [Edge(whole, edges[0].label), *edges[1:-1]]
-    return edges
 
 
 def snapped(edge: Edge, axes: np.ndarray, extent: float) -> Edge:

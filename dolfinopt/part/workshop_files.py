@@ -12,7 +12,7 @@ import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
-from xml.sax.saxutils import quoteattr
+from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
@@ -390,16 +390,10 @@ def svg_text(shape: Shape, title: str) -> str:
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.6g}mm" height="{height:.6g}mm" '
         f'viewBox="{low[0]:.9g} {-high[1]:.9g} {width:.9g} {height:.9g}">\n'
-        f"<title>{_escaped(title)}</title>\n"
+        f"<title>{escape(title)}</title>\n"
         f'<path d="{path}" fill="#b0bec5" fill-rule="evenodd" stroke="#000" stroke-width="0.25"/>\n'
         "</svg>\n"
     )
-
-
-def _escaped(text: str) -> str:
-    from html import escape
-
-    return escape(text, quote=False)
 
 
 def _path(loop: tuple[Piece, ...]) -> str:
