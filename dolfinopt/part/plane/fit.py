@@ -509,16 +509,22 @@ def _corner_will_do(
         place = meet(before.side, after.side, 0.0, 0.5 * (one.start + one.end))
     except BrokenError:
         return False
-    turn = turn_between(before.side.foot(place)[1], after.side.foot(place)[1])
+    a, b = before.side.foot(place)[1], after.side.foot(place)[1]
+    turn = turn_between(a, b)
     ends = np.linalg.norm(one.start - place), np.linalg.norm(one.end - place)
     if abs(turn) > CORNER or max(ends) > REACH * limits.cell:
         return False
     if turn > 0.0:
         return gap(place) <= tolerance
-    half = np.clip(-turn / 2.0, 0.5 * TURN, STEEP)
+    half = float(np.clip(-turn / 2.0, 0.5 * TURN, STEEP))
     radius = max(gap(place) / (1.0 / np.cos(half) - 1.0), limits.tool)
     room = min(np.linalg.norm(place - before.start), np.linalg.norm(after.end - place))
-    return bool(radius * np.tan(half) <= ROOM * room)
+    if radius * np.tan(half) > ROOM * room:
+        return False
+    out = -left(a) - left(b)
+    centre = place + radius / np.cos(half) * out / np.linalg.norm(out)
+    arc = Arc(centre, radius, angle_of(left(a)), turn).at(np.linspace(0.0, 1.0, 7))
+    return max(map(gap, arc)) <= tolerance
 
 
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
