@@ -1,18 +1,30 @@
-"""A convex quadratic programme with limits that cost and limits that are kept.
+"""Quadratic programmes as least-distance programmes: the shortest vector that keeps linear limits.
 
-    min g.x + x'Hx / 2 + sum_j price_j s_j   with   f + F x <= s,  s >= 0,  A x <= b,  -1 <= x <= 1
-
-by a primal-dual interior point method with Mehrotra's predictor and corrector.
-Source: Mehrotra, SIAM J. Optim. 2 (1992) 575-601, doi:10.1137/0802028.
+Source: Lawson & Hanson, Solving Least Squares Problems (1995), doi:10.1137/1.9781611971217, 23.4.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.linalg import solve_triangular
+from scipy.optimize import nnls
 
-STEPS, CLOSE = 60, 1e-8  # of the method; residual, of the scaled problem, that ends it
-TO_BOUNDARY = 0.995  # share of the way to the boundary that a step goes
+
+def least_move(A: np.ndarray, b: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the shortest x with A x <= b, and the multipliers (m,); None where there is none.
+
+    Args:
+        A, b: (m, n) and (m,).
+        size: about that of x.
+    """
+    E, f = np.vstack([-A.T, -b / size]), np.zeros(A.shape[1] + 1)
+    f[-1] = 1.0
+    try:
+        u = nnls(E, f, maxiter=50 * len(b))[0]
+    except RuntimeError:  # it goes round in circles
+        return None
+    r = E @ u - f
+    return None if abs(r[-1]) < 1e-12 else (-size * r[:-1] / r[-1], -size * u / r[-1])
 
 
 def solve(
@@ -24,67 +36,36 @@ def solve(
     slack: np.ndarray,
     A: np.ndarray,
     b: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return x (n,), and the multipliers of the limits that cost (m,).
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return x (n,), and the multipliers of the limits that cost (m,), of a quadratic programme.
+
+    None where rounding leaves no solution.
+
+        min g.x + x'Hx / 2 + sum_j price_j (s_j + s_j^2 / 2)
+        with  f + F x <= s,  s >= 0,  A x <= b,  -1 <= x <= 1
+
+    With H = L L' it is the shortest z = (L'x + L^-1 g, price^1/2 (s + 1)).
 
     Args:
-        H, g: (n, n) and (n,) of what is minimised.
+        H, g: (n, n), positive definite, and (n,) of what is minimised.
         F, f: (m, n) and (m,) limits that cost.
         prices: (q,) of the slacks s.
         slack: (m,) number of the slack of every limit.
-        A, b: (k, n) and (k,) limits that are kept.
+        A, b: (k, n) and (k,) limits that are kept, by x = 0 among others.
     """
-    n, m, q = len(g), len(f), len(prices)
-    size = max(float(np.abs(g).max(initial=0.0)), 1e-300)
-    x, s, none = np.eye(n), np.eye(q), np.zeros
-    rows = [[F, -s[slack]], [A, none((len(b), q))], [none((q, n)), -s]]
-    C = np.block([*rows, [x, none((n, q))], [-x, none((n, q))]])
-    d = np.concatenate([-f, b, np.zeros(q), np.ones(2 * n)])
-    Q = np.zeros((n + q, n + q))
-    Q[:n, :n] = H / size
-    Q += 1e-10 * np.eye(n + q)
-    c = np.concatenate([g, prices]) / size
-    z = np.concatenate([np.zeros(n), np.full(q, f.max(initial=0.0) + 0.1)])
-    w, y = np.maximum(d - C @ z, 0.1), np.full(len(d), 0.1 * c.max(initial=1.0))
-    for _ in range(STEPS):
-        dual, primal, mean = Q @ z + c + y @ C, C @ z + w - d, w @ y / len(d)
-        off = np.abs(dual).max() / (1.0 + np.abs(c).max())
-        if max(off, np.abs(primal).max(), mean) < CLOSE:
-            break
-        K = Q + (C.T * (y / w)) @ C
-        try:
-            factor = cho_factor(K + 1e-13 * np.diag(np.diag(K)), check_finite=False)
-        except LinAlgError:
-            break
-        at = C, factor, w, y, dual, primal
-        _, dw, dy = _direction(*at, w * y)
-        reach = min(_reach(w, dw), _reach(y, dy))
-        share = ((w + reach * dw) @ (y + reach * dy) / len(d) / mean) ** 3
-        dz, dw, dy = _direction(*at, w * y + dw * dy - share * mean)
-        reach = TO_BOUNDARY * min(_reach(w, dw), _reach(y, dy))
-        if not (np.isfinite(reach) and np.isfinite(dz).all()):
-            break
-        z, w, y = z + reach * dz, w + reach * dw, y + reach * dy
-    return np.clip(z[:n], -1.0, 1.0), size * y[:m]
-
-
-def _direction(
-    C: np.ndarray,
-    factor: tuple[np.ndarray, bool],
-    w: np.ndarray,
-    y: np.ndarray,
-    dual: np.ndarray,
-    primal: np.ndarray,
-    target: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return Newton's step of unknowns, slacks w and multipliers y, whose products shall fall."""
-    right = -dual - ((y * primal - target) / w) @ C
-    dz = cho_solve(factor, right, check_finite=False)
-    dw = -primal - C @ dz
-    return dz, dw, (-target - y * dw) / w
-
-
-def _reach(v: np.ndarray, step: np.ndarray) -> float:
-    """Return by how much of a step v (n,) > 0 stays so, at most 1."""
-    down = step < 0.0
-    return min(1.0, float((-v[down] / step[down]).min(initial=1.0)))
+    n, q = len(g), len(prices)
+    L, root = np.linalg.cholesky(H), np.sqrt(prices)
+    shift = solve_triangular(L, g, lower=True)
+    by_x = np.vstack([F, A, np.zeros((q, n)), np.eye(n), -np.eye(n)])
+    by_s = np.zeros((len(by_x), q))
+    by_s[np.arange(len(f)), slack] = -1.0
+    by_s[len(f) + len(b) + np.arange(q), np.arange(q)] = -1.0
+    by_z = solve_triangular(L, by_x.T, lower=True).T
+    right = np.concatenate([-f, b, np.zeros(q), np.ones(2 * n)]) + by_z @ shift + by_s.sum(axis=1)
+    size = float(np.hypot(np.linalg.norm(shift), np.linalg.norm(root * (1.0 + f.max(initial=0.0)))))
+    found = least_move(np.hstack([by_z, by_s / root]), right, size)
+    if found is None:
+        return None
+    z, dual = found
+    x = solve_triangular(L.T, z[:n] - shift)
+    return np.clip(x, -1.0, 1.0), dual[: len(f)]

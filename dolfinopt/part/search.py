@@ -326,10 +326,11 @@ class Search:
         return max(tries, key=lambda one: one.fall, default=None)
 
     def _trial(self, state: State, linear: Linear, seen: Step | None) -> Step | None:
-        x, promised, multipliers, places = self._programme(state, linear, seen)
-        found = self._led_to(state, x)
-        if found is None:
+        solved = self._programme(state, linear, seen)
+        found = None if solved is None else self._led_to(state, solved[0])
+        if solved is None or found is None:
             return None
+        x, promised, multipliers, places = solved
         after, whole, anew = found
         fall = self._merit(state, state) - self._merit(after, state)
         return Step(x, promised, multipliers, places, after, whole, anew, fall)
@@ -342,7 +343,7 @@ class Search:
 
     def _programme(
         self, state: State, linear: Linear, seen: Step | None
-    ) -> tuple[np.ndarray, float, np.ndarray, dict[Place, float]]:
+    ) -> tuple[np.ndarray, float, np.ndarray, dict[Place, float]] | None:
         """Return a step, the fall of the merit that it promises, and all multipliers.
 
         With a step that was seen, limits pass through what they were after it.
@@ -360,7 +361,10 @@ class Search:
         slack = np.append(np.arange(m), np.full(len(keys), m)).astype(int)
         H = far[:, None] * self.H * far + 1e-6 * abs(base[0]) * np.eye(len(far))
         g = linear.slopes[0] * far
-        x, dual = solve(H, g, F, f, np.full(m + 1, price), slack, linear.A * far, linear.b)
+        solved = solve(H, g, F, f, np.full(m + 1, price), slack, linear.A * far, linear.b)
+        if solved is None:
+            return None
+        x, dual = solved
 
         def missed(values: np.ndarray) -> float:
             return float(np.maximum(values[:m], 0.0).sum() + values[m:].max(initial=0.0))

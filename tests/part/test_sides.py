@@ -11,9 +11,10 @@ from parts import frame
 from dolfinopt.errors import InputError
 from dolfinopt.part.part import Curves
 from dolfinopt.part.plane.curves import Arc, Line, Spline
-from dolfinopt.part.plane.limits import Limits, least_move, rounded_radii
+from dolfinopt.part.plane.limits import Limits, rounded_radii
 from dolfinopt.part.plane.part import make_part
 from dolfinopt.part.plane.sides import Circle, Corner, Loop, Side, Sides
+from dolfinopt.part.program import least_move, solve
 
 pytestmark = pytest.mark.serial
 
@@ -139,8 +140,33 @@ def test_rounded_radii_are_whole_half_millimetres():
 def test_shortest_move_is_that_of_the_book():
     """The foot of the origin on x + y >= 2 and x >= 1.5."""
     A, b = np.array([[-1.0, -1.0], [-1.0, 0.0]]), np.array([-2e-3, -1.5e-3])
-    np.testing.assert_allclose(least_move(A, b), [1.5e-3, 5e-4], atol=1e-12)
-    assert least_move(np.array([[1.0], [-1.0]]), np.array([-1e-3, -1e-3])) is None
+    x, dual = least_move(A, b, 1e-3)
+    np.testing.assert_allclose(x, [1.5e-3, 5e-4], atol=1e-12)
+    np.testing.assert_allclose(-dual @ A, x, atol=1e-12)
+    assert least_move(np.array([[1.0], [-1.0]]), np.array([-1e-3, -1e-3]), 1e-3) is None
+
+
+def test_quadratic_programme_keeps_its_conditions():
+    """Of Karush, Kuhn and Tucker: multipliers of limits that cost between 0 and what they cost."""
+    rng = np.random.default_rng(0)
+    n, m = 12, 6
+    H, g = 0.1 * np.eye(n), rng.normal(size=n)
+    F, f = rng.normal(size=(m, n)), rng.normal(size=m)
+    A, b = rng.normal(size=(20, n)), rng.uniform(size=20)
+    prices = np.full(m, 0.3)
+    x, dual = solve(H, g, F, f, prices, np.arange(m), A, b)
+    assert (A @ x <= b + 1e-9).all() and np.abs(x).max() <= 1.0
+    missed = f + F @ x
+    assert ((dual > -1e-9) & (dual <= prices * (1.0 + np.maximum(missed, 0.0)) + 1e-9)).all()
+    assert np.abs(dual[missed < -1e-6]).max(initial=0.0) < 1e-9
+    np.testing.assert_allclose(dual[missed > 1e-6], (prices * (1.0 + missed))[missed > 1e-6])
+
+    def merit(y):
+        s = np.maximum(f + F @ y, 0.0)
+        return g @ y + 0.5 * y @ H @ y + prices @ (s + 0.5 * s**2)
+
+    for y in np.clip(x + 1e-3 * rng.normal(size=(200, n)), -1.0, 1.0):
+        assert (A @ y > b).any() or merit(y) >= merit(x) - 1e-12
 
 
 def test_ties_hold_mirror_images():

@@ -4,7 +4,6 @@ Every limit is a row g + A x <= 0 with closed-form derivatives. Widths are measu
 along the outline to the exact nearest point of every other piece; of a pair of pieces the least
 and the farthest place count. The nearest outline that keeps all rows is found by a few of Newton's
 steps, each the shortest x with A x <= -g.
-Source: Lawson & Hanson, Solving Least Squares Problems (1995), doi:10.1137/1.9781611971217, 23.4.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
 from dolfinopt.part.domain import Domain
@@ -32,6 +30,7 @@ from dolfinopt.part.plane.sides import (
     turn_between,
     unit,
 )
+from dolfinopt.part.program import least_move
 
 if TYPE_CHECKING:
     from shapely import Geometry
@@ -185,10 +184,10 @@ class Limits:
                 if g.max(initial=-1.0) < KEPT:
                     return (sides, whole) if self.is_simple(sides) else None
                 some = g > -FARTHEST * self.cell
-                x = least_move(A[some], -g[some] - margin[some])
-                if x is None or (size := np.abs(x).max()) > 6.0 * FARTHEST * self.cell:
+                found = least_move(A[some], -g[some] - margin[some], self.cell)
+                if found is None or (size := np.abs(found[0]).max()) > 6.0 * FARTHEST * self.cell:
                     return None
-                x = x * min(1.0, FARTHEST * self.cell / size)
+                x = found[0] * min(1.0, FARTHEST * self.cell / size)
                 sides, whole = sides.moved(sides.ties @ x), whole + x
             except BrokenError:
                 return None
@@ -240,18 +239,6 @@ def rounded_radii(sides: Sides, limits: Limits) -> Sides:
     made = replace(sides, loops=loops, circles=circles, holds_radii=True)
     found = limits.nearest(made, area=sides.shape.area) or limits.nearest(made)
     return sides if found is None else replace(found[0], holds_radii=False)
-
-
-def least_move(A: np.ndarray, b: np.ndarray) -> np.ndarray | None:
-    """Return the shortest x with A x <= b, m; None where there is none."""
-    G, h = -1e3 * A, -1e3 * b  # mm
-    E, f = np.vstack([G.T, h]), np.zeros(A.shape[1] + 1)
-    f[-1] = 1.0
-    try:
-        r = E @ nnls(E, f, maxiter=50 * len(h))[0] - f
-    except RuntimeError:  # it goes round in circles
-        return None
-    return None if abs(r[-1]) < 1e-12 else -r[:-1] / r[-1]
 
 
 def _angle(sides: Sides, one: Placed, end: int) -> np.ndarray:
