@@ -3,9 +3,8 @@
 A step minimises the objective, linear, plus the curvature of the Lagrangian (damped BFGS) and the
 price of missed limits, all limits and the limits of the geometry linear, within a box; then the
 nearest outlines are taken that keep the geometry's limits. Stress has a row for every fillet or
-side that comes near its limit. Limits v count as 2 (1 - (1 + v)^-1/2), nearly linear in the width
-of what bends. A step is judged by the exact penalty; one that is spoilt by the stress of a place
-that was not differentiated is computed again with it, one spoilt by curvature corrected once.
+side that comes near its limit. A step is judged by the exact penalty; one that is spoilt by the
+stress of a place that was not differentiated is computed again with it.
 Source: Nocedal & Wright, Numerical Optimization (2006), doi:10.1007/978-0-387-40065-5, 18.5.
 """
 
@@ -28,16 +27,11 @@ FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.5, 2.0, 0.005  # of the trust reg
 FOLLOWED = 6  # steps that a mesh follows
 SETTLED = 1e-2  # relative fall of the objective on two new meshes that ends the search
 MOST, OLD = 6, 5  # places that are differentiated in a step; steps that their rows hold
-ACTIVE = 0.01  # of all multipliers of places: that of one whose row is found anew in each step
-ATTEMPTS = 3  # at a step of one radius
+ATTEMPTS, ENOUGH = 3, 0.3  # at a step of one radius; of the promised fall, that ends them
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
 # Price of limits that shall be met above all; steps to that, at most; trust region of the first.
 DEAR, RESTORING, NEARBY = 50.0, 3, 0.05
 FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
-ENDS = 1.5  # of the way of a side's end, that a corner may go in a step
-# Of the box of a variable: after a step in the direction of the one before, in the other; bounds.
-# On lightest_two_arm 24 steps come to 1.077 kg for 1.088.
-ON, BACK, STILL, BOUNDS = 1.2, 0.6, 0.01, (0.05, 8.0)
 # Of the promised fall: what a step must bring, and what makes the next one shorter, or longer.
 ACCEPTED, POOR, GOOD = 0.05, 0.25, 0.6
 SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
@@ -45,16 +39,6 @@ AGAIN = 0.1  # trust region on a new mesh after no step bettered the parts, at l
 ALLOWED = 0.05  # relative excess of a limit above which a search has not settled
 
 Tell = Callable[[str], None]
-
-
-def bent(v: np.ndarray) -> np.ndarray:
-    """Return 2 (1 - (1 + v)^-1/2) of constraints (m,)."""
-    return np.asarray(2.0 * (1.0 - np.maximum(1.0 + v, 0.05) ** -0.5))
-
-
-def bent_slope(v: np.ndarray) -> np.ndarray:
-    """Return its derivative (m,)."""
-    return np.asarray(np.maximum(1.0 + v, 0.05) ** -1.5)
 
 
 def damped(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -97,14 +81,13 @@ class Step:
     """A trial step.
 
     Attributes:
-        x: (n,) asked for.
         promised: fall of the merit.
         multipliers: (m,) of limits; places: those of places.
         state, whole: what it leads to, and the whole step (n,) with the way to a valid outline.
         anew: whether meshes were made anew.
+        fall: of the merit.
     """
 
-    x: np.ndarray
     promised: float
     multipliers: np.ndarray
     places: Mapping[Place, float]
@@ -128,8 +111,7 @@ class Search:
         self.problem, self.state, self.meshed = problem, state, state.outlines
         self.since, self.falls, self.steps = FOLLOWED, list[float](), steps
         self.radius, self.price = FIRST_RADIUS, PRICE
-        self.H, self.way, self.reach = np.zeros((0, 0)), np.zeros(0), np.zeros(0)
-        self.priced: set[Place] = set()
+        self.H = np.zeros((0, 0))
         self.rows: dict[Place, tuple[np.ndarray, int]] = {}
         self.before: tuple[Step, Linear] | None = None
 
@@ -218,8 +200,7 @@ class Search:
             if key in places and len(row[0]) == slopes.shape[1] and self.steps - row[1] <= OLD
         }
         hottest = sorted((k for k in places if places[k] > NEAR), key=lambda k: -places[k])
-        stale = [k for k in hottest if k not in self.rows or k in self.priced]
-        self._learn(state, stale[:MOST])
+        self._learn(state, [k for k in hottest if k not in self.rows][:MOST])
         self._curved(slopes)
         while self.radius > LEAST_RADIUS:
             linear = self._linear(state, slopes)
@@ -242,14 +223,6 @@ class Search:
             self.price = min(self.price, max(OVER * dual, 0.7 * self.price, LEAST_PRICE))
         if step.state.excess > max(5.0 * EXCESS, FALLS * state.excess):  # limits cost too little
             self.price *= 2.0
-        least = ACTIVE * sum(step.places.values())
-        self.priced = {key for key, price in step.places.items() if price > least}
-        way = step.x / linear.far
-        if len(self.way) == len(way):
-            turned = way * self.way
-            factor = np.select([turned > STILL, turned < -STILL], [ON, BACK], 1.0)
-            self.reach = np.clip(factor * self.reach, *BOUNDS)
-        self.way = way
         self.before = None if step.anew else (step, linear)
         self.since, self.steps, self.state = self.since + 1, self.steps + 1, step.state
 
@@ -282,96 +255,62 @@ class Search:
             wide[:, first : first + one.count] = own[near]
             A.append(wide / one.cell)
             b.append(np.maximum(-g[near] / one.cell, 0.0))
-            # Corners that hardly turn go far where their sides do not.
-            ends = one.ends_by_x() / one.cell
-            ends = ends[np.abs(ends).sum(axis=1) * one.cell > ENDS]
-            wide = np.zeros((2 * len(ends), slopes.shape[1]))
-            wide[:, first : first + one.count] = np.vstack([ends, -ends])
             first += one.count
-            A.append(wide)
-            b.append(np.full(len(wide), ENDS * reach))
             far.append(np.full(one.count, reach * one.cell))
         hot = {key: row for key, (row, _) in self.rows.items()}
-        widest = np.concatenate(far)
-        if len(self.reach) != len(widest):
-            self.reach = np.ones(len(widest))
-        return Linear(slopes, hot, np.vstack(A), np.concatenate(b), self.reach * widest)
+        return Linear(slopes, hot, np.vstack(A), np.concatenate(b), np.concatenate(far))
 
     def _tried(self, state: State, linear: Linear) -> Step | None:
         """Return the best of the trial steps of one radius; None: none makes parts."""
         tries: list[Step] = []
-        seen: Step | None = None
         for _ in range(ATTEMPTS):
-            step = self._trial(state, linear, seen)
+            step = self._trial(state, linear)
             if step is None:
                 break
             tries.append(step)
-            if step.fall >= 0.3 * step.promised or seen is not None:
-                break
-            after, places = step.state.places, state.places
-            worst = max((float(bent(np.array(v))) for v in after.values()), default=0.0)
+            after = step.state.places
+            missed = max(EXCESS, 0.4 * max(after.values(), default=0.0))
             unknown = [
                 key
                 for key in sorted(after, key=lambda k: -after[k])
-                if key in places
+                if key in state.places
                 and (key not in linear.hot or self.rows[key][1] < self.steps)
-                and bent(np.array(after[key])) > max(EXCESS, 0.4 * worst)
+                and after[key] > missed
             ]
-            if unknown:
-                self._learn(state, unknown[:MOST])
-                hot = {key: row for key, (row, _) in self.rows.items()}
-                linear = replace(linear, hot=hot)
-            else:
-                seen = step
+            if step.fall >= ENOUGH * step.promised or not unknown:
+                break
+            self._learn(state, unknown[:MOST])
+            linear = replace(linear, hot={key: row for key, (row, _) in self.rows.items()})
         return max(tries, key=lambda one: one.fall, default=None)
 
-    def _trial(self, state: State, linear: Linear, seen: Step | None) -> Step | None:
-        solved = self._programme(state, linear, seen)
-        found = None if solved is None else self._led_to(state, solved[0])
-        if solved is None or found is None:
-            return None
-        x, promised, multipliers, places = solved
-        after, whole, anew = found
-        fall = self._merit(state, state) - self._merit(after, state)
-        return Step(x, promised, multipliers, places, after, whole, anew, fall)
-
-    def _merit(self, one: State, held: State) -> float:
-        v, price = one.against(held.held), self.price * abs(held.values[0])
-        worst = max(one.places.values(), default=-1.0)
-        missed = np.maximum(bent(np.append(v[1:], worst)), 0.0).sum()
-        return float(v[0] + price * missed)
-
-    def _programme(
-        self, state: State, linear: Linear, seen: Step | None
-    ) -> tuple[np.ndarray, float, np.ndarray, dict[Place, float]] | None:
-        """Return a step, the fall of the merit that it promises, and all multipliers.
-
-        With a step that was seen, limits pass through what they were after it.
-        """
+    def _trial(self, state: State, linear: Linear) -> Step | None:
+        """Return the step that the linear limits allow, and what it leads to; None: no parts."""
         keys, base, far = list(linear.hot), state.against(state.held), linear.far
-        m, places = len(base) - 1, state.places
-        v = np.append(base[1:], [places[k] for k in keys])
-        F = np.vstack([linear.slopes[1:], *linear.hot.values()]) * bent_slope(v)[:, None] * far
-        f = bent(v)
-        if seen is not None:
-            own, other = seen.state.against(state.held), seen.state.places
-            after = np.append(own[1:], [other.get(k, places[k]) for k in keys])
-            f = bent(after) - F @ (seen.whole / far)
+        m = len(base) - 1
+        f = np.append(base[1:], [state.places[k] for k in keys])
+        F = np.vstack([linear.slopes[1:], *linear.hot.values()]) * far
         price = self.price * abs(base[0])
         slack = np.append(np.arange(m), np.full(len(keys), m)).astype(int)
         H = far[:, None] * self.H * far + 1e-6 * abs(base[0]) * np.eye(len(far))
         g = linear.slopes[0] * far
         solved = solve(H, g, F, f, np.full(m + 1, price), slack, linear.A * far, linear.b)
-        if solved is None:
+        led = None if solved is None else self._led_to(state, solved[0] * far)
+        if solved is None or led is None:
             return None
-        x, dual = solved
+        (x, dual), (after, whole, anew) = solved, led
 
         def missed(values: np.ndarray) -> float:
             return float(np.maximum(values[:m], 0.0).sum() + values[m:].max(initial=0.0))
 
-        promised = -g @ x - 0.5 * x @ H @ x + price * (missed(f) - missed(f + F @ x))
-        dual = dual * bent_slope(v)
-        return x * far, float(promised), dual[:m], dict(zip(keys, dual[m:], strict=True))
+        promised = float(-g @ x - 0.5 * x @ H @ x + price * (missed(f) - missed(f + F @ x)))
+        fall = self._merit(state, state) - self._merit(after, state)
+        places = dict(zip(keys, dual[m:], strict=True))
+        return Step(promised, dual[:m], places, after, whole, anew, fall)
+
+    def _merit(self, one: State, held: State) -> float:
+        v, price = one.against(held.held), self.price * abs(held.values[0])
+        worst = max(one.places.values(), default=-1.0)
+        return float(v[0] + price * np.maximum(np.append(v[1:], worst), 0.0).sum())
 
     def _led_to(self, state: State, x: np.ndarray) -> tuple[State, np.ndarray, bool] | None:
         """Return the state after a step, the whole step, and whether its meshes are new."""

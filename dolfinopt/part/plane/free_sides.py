@@ -17,10 +17,8 @@ from dolfinopt.part.plane.curves import Line
 from dolfinopt.part.plane.limits import Limits
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import (
-    ArcMoves,
     Circle,
     Corner,
-    LineMoves,
     Loop,
     Side,
     Sides,
@@ -84,15 +82,6 @@ class FreeSides:
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Return what must not be positive (m,), m, and its derivatives (m, count)."""
         return self.limits.rows(self.sides)
-
-    def ends_by_x(self) -> np.ndarray:
-        """Return the derivatives (m, count) by x of the places of all corners and fillets."""
-        found = [
-            one.moves.centre if isinstance(one.moves, ArcMoves) else one.moves.start
-            for one in self.sides.placed
-            if isinstance(one.moves, (ArcMoves, LineMoves))
-        ]
-        return np.vstack([np.zeros((1, self.sides.numbers[0])), *found]) @ self.sides.ties
 
     def simplified(self, fewer: Fewer = simplifications) -> tuple[FreeSides, int]:
         """Return it without what its limits hold at its least, and how many such things went.
