@@ -308,7 +308,6 @@ def largest_of(peaks: Mapping[int, Peak], scene: Scene) -> tuple[Peak | None, st
 # Change by the last refinement up to which a figure counts as converged: a method of second order
 # leaves a third of it. Of stress more, but of the curved outlines of parts whose stress is limited.
 SETTLED, SETTLED_STRESS, SETTLED_LIMITED = 1.5e-2, 0.1, 2e-2
-ROUNDS_LIMITED = 5  # refinements of the mesh where limited stress is largest, at most
 SAFE = 1.5  # buckling factor below which the program warns
 LOST = 0.05  # compliance above that of the densities from which on parts are another design
 DENSITY, CRISP, PART, OPTIMISED = "density", "crisp", "part", "optimised part"
@@ -571,9 +570,8 @@ def refined(
     """
     places: dict[int, list[np.ndarray]] = {k: [] for k in parts}
     most = max((one.REFINEMENTS for one in parts.values()), default=0)
-    settled = SETTLED_STRESS
-    if most and scene.constraints.limit("stress") is not None:
-        most, settled = ROUNDS_LIMITED, SETTLED_LIMITED
+    limited = most and scene.constraints.limit(STRESS) is not None
+    settled = SETTLED_LIMITED if limited else SETTLED_STRESS
     for round_ in range(most + 1):
         if most:
             meshes = {k: part.mesh(finer=places[k]) for k, part in parts.items()}

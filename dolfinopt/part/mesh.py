@@ -23,7 +23,7 @@ from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
 from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, tetrahedra_of
-from dolfinopt.part.domain import INBOARD, OUTBOARD, SolidDomain
+from dolfinopt.part.domain import INBOARD, OUTBOARD, ROUNDING, SolidDomain
 from dolfinopt.part.plane.curves import Arc, Curve, Shape, Spline, curvature
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from dolfinopt.part.solid.part import SolidPart
 
 CORNER = np.radians(10.0)  # turn of the outline from which on a joint of curves is a corner
-FOLDED = 1e-3  # shape of a triangle, 1 where it is equilateral, below which it counts as folded
+FOLDED = 1e-3  # shape of a cell, 1 where it is equilateral, below which it counts as folded
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +207,6 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 TURN = 0.6  # of the outline along a side of a cell, rad, but where a finer one is asked for
 FINE = 0.2  # rad, there; halved for every further time
-PLATE_TURN = 0.9  # the same of plates in space, whose cells are as long as they are thick
 LARGEST = 2.5  # side of a cell, cells of the design
 SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
@@ -221,8 +220,7 @@ def body_mesh(
     shape: Shape,
     cell: float,
     coarser: float = 1.0,
-    finer: Sequence[np.ndarray] = (),
-    turn: float = TURN,
+    finer: Sequence[np.ndarray] | None = (),
 ) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
@@ -231,14 +229,13 @@ def body_mesh(
         cell: size of the design's cells, m.
         coarser: factor of the sides of all triangles.
         finer: places (n, 2), m, near which sides are half as long, and the outline turns by `FINE`
-            along them; half of both for every further array.
-        turn: of the outline along a side elsewhere, rad.
+            along them; half of both for every further array. None: it does so everywhere.
 
     Raises:
         InputError: straight sides along its curves cross each other, however short.
     """
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = _sizes(shape, samples, cell, finer, turn)
+    sizes = _sizes(shape, samples, cell, finer)
     for _ in range(FINER):
         outline = _outline(shape, samples, [coarser * size for size in sizes])
         if outline.is_simple:  # Gmsh would end the process
@@ -318,8 +315,7 @@ def _sizes(
     shape: Shape,
     samples: Sequence[np.ndarray],
     cell: float,
-    finer: Sequence[np.ndarray],
-    turn: float,
+    finer: Sequence[np.ndarray] | None,
 ) -> list[np.ndarray]:
     """Return the wanted sides of cells at the samples of every piece, m."""
     curves = shape.curves
@@ -329,8 +325,8 @@ def _sizes(
     bend = np.maximum(bend, 1e-9 / cell)
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     side = np.minimum(_widths(points, inward, near), LARGEST * cell)  # one cell across a member
-    turns = np.full(len(points), turn)
-    for number, places in enumerate(finer):
+    turns = np.full(len(points), FINE if finer is None else TURN)
+    for number, places in enumerate(finer or ()):
         size = np.minimum(side, turns / bend)
         here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)
         turns = np.where(here, np.minimum(turns, FINE * 0.5**number), turns)
@@ -420,11 +416,9 @@ TRIES = ((40.0, 1.0), (60.0, 1.0), (80.0, 1.0), (40.0, 0.75), (60.0, 0.75), (40.
 MOST = 10_000  # cells of a part, about
 ACROSS = 3.0  # cells over the smaller of a part's height and thickness, at least
 IN_CUBE = 8.5  # tetrahedra that fill a cube on one of their sides
-NEAR = 1e-6  # of a cell: distance of points from the arm's faces up to which they lie on them
 BESIDE = 0.1  # of a cell: distance of a facet's middle from a further interface that it belongs to
-LEAST = 1e-3  # shape of the worst cell, of a valid mesh
-SAME_VOLUME = 1e-4  # relative, of a mesh that is taken to the part
-ROUNDS = 10  # of holding points whose cells a correction of the volume would spoil
+SAME_VOLUME = 1e-4  # relative, of parts to designs, of meshes to parts
+ROUNDS = 10  # of moving less where cells would be spoilt, or a surface cross itself
 APART = 1e-6  # relative, of a mesh's volume to the part's
 
 
@@ -460,7 +454,7 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
             continue
         mesh = _of_volume(part, mesh)
         off = mesh.volumes.sum() / part.volume - 1.0
-        if mesh.quality.min() <= LEAST:
+        if mesh.quality.min() <= FOLDED:
             reason = "its cells are flat"
         elif abs(off) > SAME_VOLUME:
             reason = f"its mesh has {100.0 * off:+.2g} % of its volume more"
@@ -472,7 +466,7 @@ def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:
 def _freeform_mesh(part: SolidPart, size: float, edge: float) -> Tetrahedra:
     domain, surface = part.domain, part.surface
     centres = surface.corners.mean(axis=1)
-    near = NEAR * domain.cell
+    near = ROUNDING * domain.cell
     inboard, outboard = (
         distance_to_faces(centres, faces) < near for faces in (domain.inboard, domain.outboard)
     )
@@ -517,7 +511,7 @@ class PlateMesh(Tetrahedra):
 
 def _plate_mesh(flat: PlanePart, size: float) -> PlateMesh:
     thickness = flat.domain.thickness
-    face = body_mesh(flat.shape, flat.domain.cell, size / flat.domain.cell, turn=PLATE_TURN)
+    face = body_mesh(flat.shape, flat.domain.cell, size / flat.domain.cell)
     return extruded(face, thickness, max(1, round(thickness / size)))
 
 
@@ -563,11 +557,11 @@ def _of_volume(part: SolidPart, mesh: Tetrahedra) -> Tetrahedra:
     free[facets] = True
     faces = np.concatenate([domain.own, domain.kept])
     rim = np.flatnonzero(free)
-    free[rim] = distance_to_faces(mesh.points[rim], faces) > NEAR * domain.cell
+    free[rim] = distance_to_faces(mesh.points[rim], faces) > ROUNDING * domain.cell
     for _ in range(ROUNDS):
         moved = with_volume(Surface(mesh.points, facets), free, wanted)
         found = replace(mesh, points=moved.points)
-        spoilt = (found.quality <= LEAST) & (found.quality < mesh.quality)
+        spoilt = (found.quality <= FOLDED) & (found.quality < mesh.quality)
         if not spoilt.any():
             return found
         free[mesh.cells[spoilt]] = False

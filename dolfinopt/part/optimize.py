@@ -22,7 +22,7 @@ from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, mesh_parts
 from dolfinopt.part.plane.fit import fitted_sides
 from dolfinopt.part.plane.free_sides import FreeSides
-from dolfinopt.part.plane.layouts import trusses_of
+from dolfinopt.part.plane.layouts import SMALLEST_HOLE, trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.outline import without_stubs
 from dolfinopt.part.plane.part import PlanePart
@@ -34,12 +34,10 @@ from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 
-ITERATIONS = 80  # default, at most, from every start
 REPAIRS = 3  # times that limits missed in the end are met by further steps
 START = 1.2  # distance of the first sides from the densities' outline, cells
 # Width of members that go where they end nowhere, cells: else the rod misses its stress by 45 %.
 STUB = 1.5
-SMALLEST = 3.0  # area of a hole that a search begins with, squared cells
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 
 Outlines = Mapping[int, FreeSides]
@@ -127,7 +125,7 @@ class Optimized:
 def optimize_parts(
     scene: Scene,
     parts: Mapping[int, Part],
-    iterations: int = ITERATIONS,
+    iterations: int,
     tell: Tell = print,
     starts: int = 0,
     keep: Keep | None = None,
@@ -215,7 +213,7 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
     )
     solid = part.domain if isinstance(part, SolidPart) else None
     cell = flat.domain.cell
-    hole = SMALLEST * max(cell, limits.tool) ** 2
+    hole = SMALLEST_HOLE * max(cell, limits.tool) ** 2
     outline = without_stubs(flat.outline, limits, STUB * cell)
     sides = flat.sides
     with suppress(InputError):  # where few do not keep the limits, the part's own will do

@@ -29,14 +29,13 @@ SETTLED = 1e-2  # relative fall of the objective on two new meshes that ends the
 MOST, OLD = 6, 5  # places that are differentiated in a step; steps that their rows hold
 ATTEMPTS, ENOUGH = 3, 0.3  # at a step of one radius; of the promised fall, that ends them
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
-# Price of limits that shall be met above all; steps to that, at most; trust region of the first.
-DEAR, RESTORING, NEARBY = 50.0, 3, 0.05
+# Price of limits that shall be met above all; steps to that, at most; trust region of the first,
+# and of the first on a new mesh after no step bettered the parts.
+DEAR, RESTORING, NEARBY = 50.0, 3, 0.1
 FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
 # Of the promised fall: what a step must bring, and what makes the next one shorter, or longer.
 ACCEPTED, POOR, GOOD = 0.05, 0.25, 0.6
 SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
-AGAIN = 0.1  # trust region on a new mesh after no step bettered the parts, at least
-ALLOWED = 0.05  # relative excess of a limit above which a search has not settled
 
 Tell = Callable[[str], None]
 
@@ -127,7 +126,7 @@ class Search:
             if self._step():
                 tell(self._line())
             elif self.since > 0:
-                self.since, self.radius = FOLLOWED, max(self.radius, AGAIN)
+                self.since, self.radius = FOLLOWED, max(self.radius, NEARBY)
             elif not self._simplified():
                 return "no step betters the parts"
 
@@ -174,9 +173,9 @@ class Search:
         return self.state is not before
 
     def _settled(self) -> bool:
-        if len(self.falls) < 3 or self.state.excess > ALLOWED:
-            return False
-        return bool(self.falls[-3] - self.falls[-1] < SETTLED * abs(self.falls[-1]))
+        return len(self.falls) > 2 and bool(
+            self.falls[-3] - self.falls[-1] < SETTLED * abs(self.falls[-1])
+        )
 
     def _line(self) -> str:
         one = self.state

@@ -20,8 +20,8 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Edge
 from dolfinopt.part.plane.curves import MIRROR, Arc, Curve, Line, Piece
-from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, TURN, Limits
-from dolfinopt.part.plane.outline import Outline
+from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, SHORT, TURN, Limits
+from dolfinopt.part.plane.outline import AREA, Outline
 from dolfinopt.part.plane.sides import (
     BrokenError,
     Circle,
@@ -41,12 +41,10 @@ LEAST = 0.3  # length of a side that is worth drawing, cells
 SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
 ATTEMPTS, COARSER = (1.0, 0.6, 0.35), (0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
-SAME_AREA = 1e-3  # relative
 THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
 REACH = 3.0  # cells from the ends of two sides within which they meet
 CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
 STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
-SMALL = 0.05  # least radius of a fillet, cells: of a tool without radius
 ROOM = 0.45  # share of a side that a fillet at one of its ends may take
 
 
@@ -108,7 +106,7 @@ def fitted_sides(
             made = _made(outline, kept, share * tolerance, area, least)
             if made is None:
                 continue
-            off, far = abs(made.shape.area / area - 1.0) > SAME_AREA, distance(made, outline)
+            off, far = abs(made.shape.area / area - 1.0) > AREA, distance(made, outline)
             found.append((off, far, made))
             if not off and far <= tolerance:
                 break
@@ -602,7 +600,7 @@ def looped(
         ends = (places[k - 1], places[(k + 1) % len(places)])
         room = ROOM * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
         radius = min(radius_at(k, place, half), room, 0.9 * LARGEST * limits.cell)
-        radius = max(radius, limits.tool, SMALL * limits.cell)
+        radius = max(radius, limits.tool, SHORT * limits.cell)
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
         near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)
         corners.append(Corner(near, radius))

@@ -29,7 +29,6 @@ from dolfinopt.part.plane.sides import (
 from dolfinopt.part.plane.simpler import simplifications
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
-MOST = 40  # sides and holes that go at once, at most
 # Shape of a triangle, 1 where it is equilateral, below which a new mesh is due, and over the worst.
 WORN, WORSE = 0.12, 0.7
 Mesh = BodyMesh | Tetrahedra  # of a plate in space a `PlateMesh`
@@ -89,16 +88,15 @@ class FreeSides:
         Args:
             fewer: yields outlines without one of such things.
         """
-        made = self
-        for number in range(MOST):
+        made, number = self, 0
+        while True:
             for sides in fewer(made.sides, self.limits, self.part.domain.outer_edges):
                 found = replace(made, sides=sides).nearest()
                 if found is not None and found[0].count < made.count:
-                    made = found[0]
+                    made, number = found[0], number + 1
                     break
             else:
                 return made, number
-        return made, MOST
 
     def moved(self, x: np.ndarray) -> FreeSides:
         """Return it after a step x.

@@ -18,21 +18,18 @@ from scipy.optimize import brentq
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.plane.fit import fitted_sides
 from dolfinopt.part.plane.limits import limits_of_part
-from dolfinopt.part.plane.outline import polygons_of
+from dolfinopt.part.plane.outline import AREA, polygons_of
 from dolfinopt.part.plane.part import PlanePart
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
 
-# Length of a bay over its height, of the first arm and of the last one, in the order in which
-# trusses are tried: flat struts are few, and carry little shear beside the bending moment.
-BAYS = ((4.0, 2.4), (2.8, 1.7), (2.0, 2.0), (5.6, 3.4), (1.4, 1.2))
-STEEPER = 0.85  # of every further five trusses
+# Length of a bay over its height: flat struts are few, and carry little shear beside the bending
+# moment.
+BAY, LAST, STEEPER = 4.0, 0.6, 0.7  # of the first arm; of the last one over it; of every truss
 STRUT = 0.6  # width of struts over that of the flanges
-FILLET = 0.8  # radius of a truss's concave corners, cells
 FEWEST = 2  # bays of the first truss; every further one of a short arm has one more
 SMALLEST_HOLE = 4.0  # area of a hole that is worth its outline, squared cells
-AREA = 1e-3  # relative: of a truss
 CLOSE = 0.2  # distance of its sides from the polygon, cells
 
 
@@ -46,8 +43,7 @@ def trusses_of(parts: Mapping[int, PlanePart], number: int) -> dict[int, PlanePa
     Raises:
         ConvergenceError: there is no room for one.
     """
-    cycle, index = divmod(number, len(BAYS))
-    slopes = STEEPER**cycle * np.geomspace(*BAYS[index], len(parts))
+    slopes = BAY * STEEPER**number * np.geomspace(1.0, LAST, len(parts))
     return {
         k: _truss(parts[k], slope, FEWEST + number)
         for k, slope in zip(sorted(parts), slopes, strict=True)
@@ -61,7 +57,7 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     limits = limits_of_part(domain, drawn.tool_radius)
     stays = limits.stays
     arm, span = _between_bores(limits.arm, stays, domain.cell)
-    fillet = max(FILLET * domain.cell, drawn.tool_radius)
+    fillet = max(domain.cell, drawn.tool_radius)
 
     least = SMALLEST_HOLE * domain.cell**2
 

@@ -41,9 +41,7 @@ STRIP = 0.5
 LINK = 0.5
 NECK = 0.3  # width of necks that are cut, cells: a rod with them cannot be simulated
 UNIFORM = 1e-3  # range of a density without outline
-NEAR_STUB = 0.02  # of a stub's width, within which pieces of the outline touch
-# Area of a stub at least, and of its thicker end at most, squared widths.
-SMALLEST_STUB, SPECK = 0.25, 8.0
+SMALLEST_STUB = 0.25  # area of a member that ends nowhere, at least, squared widths
 
 
 def polygons_of(geometry: Geometry) -> list[Polygon]:
@@ -263,16 +261,21 @@ def _linked(whole: Geometry, links: Geometry, near: float) -> Geometry:
     return shapely.union_all([whole, *missing[joins]])
 
 
-def _without_necks(whole: Geometry, width: float, near: float) -> Geometry:
-    """Return material without what is narrower than a width, m, and joins wider parts."""
+def _narrow(whole: Geometry, width: float, near: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pieces (n,) that are narrower than a width, m, and how many wider ones each joins.
+
+    Args:
+        whole: polygons (shapely).
+        width: m.
+        near: distance within which pieces touch, m.
+    """
     import shapely
 
-    opened = whole.buffer(-0.5 * width).buffer(0.5 * width + near)
-    pieces = shapely.get_parts(whole.difference(opened))
+    wide = whole.buffer(-0.5 * width).buffer(0.5 * width + near)
+    pieces = shapely.get_parts(whole.difference(wide))
     pieces = shapely.buffer(pieces[shapely.area(pieces) > 0.01 * width**2], 3.0 * near)
-    # A corner touches one wider part.
-    necks = [len(polygons_of(one)) != 1 for one in shapely.intersection(pieces, opened)]
-    return whole.difference(shapely.union_all(pieces[necks]))
+    joined = [len(polygons_of(one)) for one in shapely.intersection(pieces, wide)]
+    return pieces, np.array(joined, dtype=int)
 
 
 def _at(domain: Domain, limits: Limits, whole: Geometry, level: float) -> Outline:
@@ -282,10 +285,12 @@ def _at(domain: Domain, limits: Limits, whole: Geometry, level: float) -> Outlin
     before = polygons_of(whole)
     closed = shapely.union_all(before).buffer(limits.tool).buffer(-limits.tool)
     filled = shapely.union_all([*before, closed]).intersection(limits.arm)
-    parts = polygons_of(_without_necks(filled, NECK * domain.cell, CHORD * domain.cell))
+    narrow, joined = _narrow(filled, NECK * domain.cell, CHORD * domain.cell)
+    necks = shapely.union_all(narrow[joined != 1])  # a corner joins one wider piece
+    parts = polygons_of(filled.difference(necks))
     near, ends = 1e-6 * domain.extent, _interfaces(domain)
-    joined = [p for p in parts if all(p.distance(one) < near for one in ends)]
-    main = max(joined, key=lambda p: p.area, default=shapely.Polygon())
+    whole = [p for p in parts if all(p.distance(one) < near for one in ends)]
+    main = max(whole, key=lambda p: p.area, default=shapely.Polygon())
     dropped = [p for p in parts if p is not main]
     holes = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in parts)
     area = float(sum(p.area for p in dropped))
@@ -299,33 +304,12 @@ def without_stubs(outline: Outline, limits: Limits, width: float) -> Outline:
     """
     import shapely
 
-    polygon, near = outline.polygon, NEAR_STUB * width
+    polygon = outline.polygon
     stays = _stays(outline.domain, limits).intersection(polygon)
-    wide = polygon.buffer(-0.5 * width).buffer(0.5 * width)
-    cores = polygons_of(wide)
-    narrow = polygons_of(polygon.difference(wide.buffer(near)))
-    members = [one.buffer(2.0 * near) for one in narrow if one.area > SMALLEST_STUB * width**2]
-    core = max(cores, key=lambda one: one.area, default=shapely.Polygon())
-    dropped: list[Geometry] = []
     while True:
-        whole = shapely.union_all(cores)
-        loose = [
-            one
-            for one in members
-            if not one.interiors and len(polygons_of(one.intersection(whole))) == 1
-        ]
-        members = [one for one in members if one not in loose]
-        ends = shapely.union_all(members)
-        alone = [
-            one
-            for one in cores
-            if one is not core
-            and len(polygons_of(ends.intersection(one))) < 2
-            and one.area < width * SPECK * width
-        ]
-        cores = [one for one in cores if one not in alone]
-        if not loose and not alone:
-            break
-        dropped += [*loose, *alone]
-    left = polygon.difference(shapely.union_all(dropped)).union(stays)
-    return replace(outline, polygon=max(polygons_of(left), key=lambda one: one.area))
+        narrow, joined = _narrow(polygon, width, outline.chord)
+        stubs = narrow[(joined == 1) & (shapely.area(narrow) > SMALLEST_STUB * width**2)]
+        left = polygons_of(polygon.difference(shapely.union_all(stubs)).union(stays))
+        before, polygon = polygon.area, max(left, key=lambda one: one.area)
+        if polygon.area > before - SMALLEST_STUB * width**2:
+            return replace(outline, polygon=polygon)

@@ -13,7 +13,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
-from dolfinopt.part.mesh import FINE, TURN, BodyMesh, body_mesh
+from dolfinopt.part.mesh import BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Concave, Shape
 from dolfinopt.part.plane.fit import distance, fitted_sides
@@ -190,9 +190,8 @@ class PlanePart:
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> BodyMesh:
         """Return triangles along its curves, see `part.Part`."""
-        turn = FINE if finer is None else TURN
         try:
-            return body_mesh(self.shape, self.domain.cell, coarser, finer or (), turn)
+            return body_mesh(self.shape, self.domain.cell, coarser, finer)
         except InputError as error:
             raise InputError(f"arm {self.name!r}: {error}") from None
 

@@ -15,7 +15,7 @@ import numpy as np
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
-from dolfinopt.part.mesh import mesh_size, solid_mesh
+from dolfinopt.part.mesh import ROUNDS, SAME_VOLUME, mesh_size, solid_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
@@ -41,11 +41,8 @@ if TYPE_CHECKING:
     from dolfinopt.part.stress import CornerStress
 
 
-SAME_VOLUME = 1e-4  # relative, of the part to the design
 FURTHEST = 0.5  # cells that a point of the part may be from where the isosurface has it
 HELD = 0.9  # of the mark of what stays solid, from which on points belong to its faces
-ROUNDS = 8  # of taking smoothing back where the surface would cross itself
-LEAST_SHARE = 0.2  # of the smoothing that is left, below which all of it is taken back
 NARROW = 0.9  # of the width asked for, below which a member or gap is told
 
 
@@ -301,18 +298,18 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
 def _uncrossed(surface: Surface, smooth: Surface, free: np.ndarray, volume: float) -> Surface:
     """Return the smoothed surface with a volume, less smooth where it would cross itself."""
     # The isosurface does not cross itself. Points of triangles that do go back towards it by
-    # halves, those beside them with them, and all the way at last; the others make up for the
-    # volume. `free` (n,) is True of points that move.
+    # halves, those beside them with them; the others make up for the volume. `free` (n,) is True
+    # of points that move.
     share = np.ones(len(surface.points))
     move = smooth.points - surface.points
     for _ in range(ROUNDS):
         now = replace(surface, points=surface.points + share[:, None] * move)
-        found = with_volume(now, free & (share > 0.0), volume)
+        found = with_volume(now, free, volume)
         crossed = crossings(found)
         if not len(crossed):
             break
         near = np.zeros(len(share), dtype=bool)
         near[surface.triangles[crossed]] = True
         near[surface.triangles[near[surface.triangles].any(axis=1)]] = True
-        share = np.where(near, np.where(share > LEAST_SHARE, 0.5 * share, 0.0), share)
+        share = np.where(near, 0.5 * share, share)
     return found
