@@ -37,9 +37,8 @@ class State:
     Attributes:
         outlines, bodies: by the arm's place in the chain.
         simulated: the machine.
-        limits: of the scene, but for the volume's, and that of the stress by places.
-        smooth, held: (k,) smooth value of each of them, and its limit, tightened and scaled so that
-            the true value is limited.
+        smooth, held: (k,) smooth value of each limit of the scene, but for the volume's and that of
+            the stress, and the limit, tightened and scaled so that the true value is limited.
         shares: relative constraints of the volumes.
         places: relative constraint of the stress of every fillet and side.
         means: p-mean, Pa, of the stress of each of them, which it follows while a mesh does.
@@ -50,7 +49,6 @@ class State:
     outlines: Mapping[int, FreeSides]
     bodies: Mapping[int, Any]
     simulated: Simulated
-    limits: tuple[Limit, ...]
     smooth: np.ndarray
     held: np.ndarray
     shares: np.ndarray
@@ -150,11 +148,10 @@ class Problem:
         limits = limits_of(simulated.scene, found)
         for one, value, limit in zip(limits, found.constraints, found.smooth_limits, strict=True):
             if one.quantity not in ("volume_fraction", STRESS):
-                rows.append((one, (1.0 + value) * limit, limit / self._factor(one)))
-        known, smooths, held = zip(*rows, strict=True) if rows else ((), (), ())
-        shares = [share for share, _ in self._volumes(outlines)]
-        smooth, most, areas = (np.array(one, dtype=float) for one in (smooths, held, shares))
-        state = State(outlines, bodies, simulated, tuple(known), smooth, most, areas)
+                rows.append(((1.0 + value) * limit, limit / self._factor(one)))
+        smooth, held = np.array(rows).reshape(-1, 2).T
+        shares = np.array([share for share, _ in self._volumes(outlines)])
+        state = State(outlines, bodies, simulated, smooth, held, shares)
         limit = self.scene.constraints.limit(STRESS)
         return state if limit is None else self._with_places(state, every, limit)
 

@@ -20,6 +20,7 @@ from dolfinopt.part.plane.curves import MIRROR, Arc, Line
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import Search
+from dolfinopt.responses.constraints import limits_of
 
 pytestmark = pytest.mark.serial
 
@@ -247,7 +248,12 @@ def test_flanges_that_would_buckle_are_kept(made):
         search.run(2, lambda line: None)
         states.append(search.state)
         found[least] = [
-            next(limit.value for limit in one.limits if limit.name == "buckling") for one in states
+            next(
+                limit.value
+                for limit in limits_of(one.simulated.scene, one.simulated.evaluation)
+                if limit.name == "buckling"
+            )
+            for one in states
         ]
     assert found[0.2][1] < 0.9 * found[0.2][0]
     assert found[1.9][1] > 1.05 * found[1.9][0]

@@ -11,46 +11,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from dolfinopt.part.plane.curves import Line, direction
+from dolfinopt.part.plane.curves import Line
 from dolfinopt.part.plane.fit import Drawn, cleaned, looped
 from dolfinopt.part.plane.limits import SHORT, TURN, Limits
 from dolfinopt.part.plane.sides import Loop, Side, Sides, angle_of, turn_between, unit
 
 NEARLY = 1.2  # of the least turn, up to which a corner hardly turns
 VANISHING = 2.5  # of the least length, up to which a side vanishes
-# Of a tooth: turn at its tip, and between the sides beside it, at most; length of its sides, cells.
-TIP, FLAT, TOOTH = np.radians(45.0), np.radians(25.0), 4.0
 SMALL = 20.0  # area of a hole that may close, squared cells or tool radii
-
-
-def without_teeth(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
-    """Yield the outline without one of its teeth: two short sides that stick out into a gap."""
-    done: set[int] = set()
-    for loop in sides.loops:
-        count = len(loop.sides)
-        for k in range(count if count > 5 else 0):
-            before, first, second, after = (loop.sides[(k + j) % count] for j in range(4))
-            names = {first.key, first.twin, second.key, second.twin} - {-1}
-            if not (first.free and second.free) or names & (done | {before.key, after.key}):
-                continue
-            lengths = _length(sides, first.key), _length(sides, second.key)
-            tip = turn_between(unit(first.angle), unit(second.angle))
-            along = (
-                direction(one.curve, 0.5) if one.curve else unit(one.angle)
-                for one in (before, after)
-            )
-            if (
-                tip > TIP
-                and max(lengths) < TOOTH * limits.cell
-                and abs(turn_between(*along)) < FLAT
-            ):
-                done |= names
-                yield from _without(sides, names, limits, outer)
 
 
 def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
     """Yield the outline without one of what its limits hold at its least."""
-    yield from without_teeth(sides, limits, outer)
     done: set[int] = set()
     for loop in sides.loops:
         count = len(loop.sides)
@@ -76,17 +48,17 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
             yield replace(sides, circles=tuple(left))
 
 
-def _lines(sides: Sides) -> dict[int, tuple[int, int, Line]]:
-    """Return loop, number and line of every straight side by its key."""
+def _lines(sides: Sides) -> dict[int, Line]:
+    """Return the line of every straight side by its key."""
     return {
-        sides.loops[one.loop].sides[one.side].key: (one.loop, one.side, one.piece.curve)
+        sides.loops[one.loop].sides[one.side].key: one.piece.curve
         for one in sides.placed
         if isinstance(one.piece.curve, Line)
     }
 
 
 def _length(sides: Sides, key: int) -> float:
-    line = _lines(sides)[key][2]
+    line = _lines(sides)[key]
     return float(np.linalg.norm(line.end - line.start))
 
 
@@ -150,7 +122,7 @@ def _without(
 def _merged(sides: Sides, a: Side, b: Side, limits: Limits, outer: int) -> Iterator[Sides]:
     """Yield the outline with one side in place of two that follow one another; images likewise."""
     lines = _lines(sides)
-    first, last = lines[a.key][2], lines[b.key][2]
+    first, last = lines[a.key], lines[b.key]
     one = replace(a, point=0.5 * (first.start + last.end), angle=angle_of(last.end - first.start))
     new = {a.key: one}
     if a.twin >= 0 and a.twin != a.key:
