@@ -22,7 +22,7 @@ from dolfinopt.density.measured import GREY
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 from dolfinopt.mesh.checks import cell_sizes, facet_corners
-from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Spline, sampled
+from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Spline, circle_through, sampled
 from dolfinopt.scene.load import Arm, Scene
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 SAME = 2e-8  # distance from a line or circle, of the extent: Gmsh's points, files of eight digits
 SHARPEST = np.radians(40.0)  # turn from side to side up to which a polygon may stand for a curve
 FEWEST = 6  # points of an arc: a circle goes through any three
+STRAIGHT = 1e4  # radius of what is no circle, sizes of its points
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,19 +140,10 @@ def _circle(points: np.ndarray, near: float, closed: bool = False) -> Arc | None
     """Return the circle through points that follow one another on it, None where there is none."""
     if len(points) < (8 if closed else FEWEST):
         return None
-    middle = points.mean(axis=0)
-    size = np.ptp(points, axis=0).max()
-    local = (points - middle) / size
-    system = np.column_stack([2.0 * local, np.ones(len(local))])
-    (x, y, rest), *_ = np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=None)
-    centre, square = np.array([x, y]), rest + x * x + y * y
-    if square <= 0.0 or square > 1e8:
+    centre, radius, off = circle_through(points)
+    if off > near or not 0.0 < radius < STRAIGHT * np.ptp(points, axis=0).max():
         return None
-    radius = np.sqrt(square)
-    off = np.linalg.norm(local - centre, axis=1) - radius
-    if np.abs(off).max() * size > near:
-        return None
-    angle = np.arctan2(*(local - centre).T[::-1])
+    angle = np.arctan2(*(points - centre).T[::-1])
     steps = np.diff(np.append(angle, angle[0]) if closed else angle)
     steps = (steps + np.pi) % (2.0 * np.pi) - np.pi
     if not ((steps > 0.0).all() or (steps < 0.0).all()) or np.abs(steps).max() > SHARPEST:
@@ -159,7 +151,7 @@ def _circle(points: np.ndarray, near: float, closed: bool = False) -> Arc | None
     sweep = float(steps.sum())
     if closed:
         sweep = float(2.0 * np.pi * np.sign(sweep))
-    return Arc(middle + size * centre, float(size * radius), float(angle[0]), sweep)
+    return Arc(centre, radius, float(angle[0]), sweep)
 
 
 def _smoothed(

@@ -371,6 +371,17 @@ def _is_ring(curve: Curve) -> bool:
     return isinstance(curve, Arc) and curve.is_circle
 
 
+def circle_through(points: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Return centre (2,) and radius of the circle of least squares, and how far points are off."""
+    middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+    local = (points - middle) / size
+    system = np.column_stack([2.0 * local, np.ones(len(local))])
+    x, y, rest = np.linalg.lstsq(system, (local**2).sum(axis=1), rcond=None)[0]
+    centre, radius = np.array([x, y]), float(np.sqrt(max(rest + x * x + y * y, 0.0)))
+    off = np.abs(np.linalg.norm(local - centre, axis=1) - radius).max()
+    return middle + size * centre, size * radius, size * float(off)
+
+
 def projected(curve: Curve, point: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the point of a curve nearest to another one, and its parameter.
 

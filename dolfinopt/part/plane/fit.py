@@ -19,7 +19,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Edge
-from dolfinopt.part.plane.curves import MIRROR, Arc, Curve, Line, Piece
+from dolfinopt.part.plane.curves import MIRROR, Arc, Curve, Line, Piece, circle_through
 from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, SHORT, TURN, Limits
 from dolfinopt.part.plane.outline import AREA, Outline
 from dolfinopt.part.plane.sides import (
@@ -320,16 +320,10 @@ def _free_circle(chain: Sequence[Run], halved: bool, tolerance: float) -> Circle
     if halved:
         points = np.vstack([points, (points * MIRROR)[::-1]])
     points = np.vstack([points, 0.5 * (points[1:] + points[:-1])])  # the polygon's sides, too
-    middle = points.mean(axis=0)
-    p = points - middle
-    system = np.column_stack([2.0 * p, np.ones(len(p))])
-    x, y, rest = np.linalg.lstsq(system, (p**2).sum(axis=1), rcond=None)[0]
-    radius = float(np.sqrt(rest + x * x + y * y))
-    centre = middle + np.array([x, 0.0 if halved else y])
-    off = np.abs(np.linalg.norm(points - centre, axis=1) - radius).max()
+    centre, radius, off = circle_through(points)
     if off > min(tolerance, 0.1 * radius):
         return None
-    return Circle(centre, radius)
+    return Circle(centre * [1.0, 0.0] if halved else centre, radius)
 
 
 def _named_circles(circle: Circle, twins: bool, halved: bool, names: Iterator[int]) -> list[Circle]:

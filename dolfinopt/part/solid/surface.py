@@ -409,18 +409,16 @@ def crossings(surface: Surface) -> np.ndarray:
     centres = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
     found = []
-    # Triangles in classes of their size, so that a large one does not make all neighbourhoods wide.
-    for low, group in _by_size(radii):
-        tree = cKDTree(centres[group])
-        reach = 0.5 * np.linalg.norm(end - start, axis=1) + 2.0 * low
-        for part in np.array_split(np.arange(len(edges)), max(1, len(edges) * CANDIDATES // MANY)):
-            near = tree.query_ball_point(0.5 * (start + end)[part], reach[part])
-            edge = np.repeat(part, [len(one) for one in near])
-            triangle = group[np.concatenate([*near, []]).astype(int)]
-            apart = (edges[edge][:, :, None] != triangles[triangle][:, None]).all(axis=(1, 2))
-            edge, triangle = edge[apart], triangle[apart]
-            through = _passes(start[edge], end[edge], corners[triangle])
-            found.append(np.column_stack([owners[edge[through]], triangle[through]]))
+    tree, middle = cKDTree(centres), 0.5 * (start + end)
+    reach = 0.5 * np.linalg.norm(end - start, axis=1) + radii.max(initial=0.0)
+    for part in np.array_split(np.arange(len(edges)), max(1, len(edges) * CANDIDATES // MANY)):
+        near = tree.query_ball_point(middle[part], reach[part])
+        edge = np.repeat(part, [len(one) for one in near])
+        triangle = np.concatenate([*near, []]).astype(int)
+        apart = (edges[edge][:, :, None] != triangles[triangle][:, None]).all(axis=(1, 2))
+        edge, triangle = edge[apart], triangle[apart]
+        through = _passes(start[edge], end[edge], corners[triangle])
+        found.append(np.column_stack([owners[edge[through]], triangle[through]]))
     return np.concatenate(found) if found else np.empty((0, 2), dtype=int)
 
 
@@ -471,12 +469,6 @@ def check_surface(name: str, surface: Surface) -> None:
         "mm; optimise with larger members (design.filter_radius), and with "
         'design.projection = "robust" until the design is crisp'
     )
-
-
-def _by_size(radii: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Return groups of triangles with radii between r and 2 r, and r."""
-    classes = np.floor(np.log2(np.maximum(radii, 1e-6 * radii.max())))
-    return [(2.0**one, np.flatnonzero(classes == one)) for one in np.unique(classes)]
 
 
 def _passes(start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarray:
