@@ -219,7 +219,7 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
         sides = fitted_sides(outline, limits, START * cell, sides.shape.area, hole)
     made = FreeSides(flat, sides, limits, solid)
     found = made.nearest()
-    return (made if found is None else found[0]).simplified()[0]
+    return made if found is None else found[0]
 
 
 def _rank(scene: Scene, found: Found) -> tuple[float, float]:
