@@ -26,6 +26,7 @@ from dolfinopt.part.plane.layouts import SMALLEST_HOLE, trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.outline import without_stubs
 from dolfinopt.part.plane.part import PlanePart
+from dolfinopt.part.plane.simpler import without_teeth
 from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import Search
 from dolfinopt.part.solid.part import SolidPart
@@ -219,7 +220,7 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
         sides = fitted_sides(outline, limits, START * cell, sides.shape.area, hole)
     made = FreeSides(flat, sides, limits, solid)
     found = made.nearest()
-    return made if found is None else found[0]
+    return (made if found is None else found[0]).simplified(without_teeth)[0]
 
 
 def _rank(scene: Scene, found: Found) -> tuple[float, float]:

@@ -11,18 +11,46 @@ from dataclasses import replace
 
 import numpy as np
 
-from dolfinopt.part.plane.curves import Line
+from dolfinopt.part.plane.curves import Line, direction
 from dolfinopt.part.plane.fit import Drawn, cleaned, looped
 from dolfinopt.part.plane.limits import SHORT, TURN, Limits
 from dolfinopt.part.plane.sides import Loop, Side, Sides, angle_of, turn_between, unit
 
 NEARLY = 1.2  # of the least turn, up to which a corner hardly turns
 VANISHING = 2.5  # of the least length, up to which a side vanishes
+# Of a tooth: turn at its tip, and between the sides beside it, at most; length of its sides, cells.
+TIP, FLAT, TOOTH = np.radians(45.0), np.radians(25.0), 4.0
 SMALL = 20.0  # area of a hole that may close, squared cells or tool radii
+
+
+def without_teeth(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
+    """Yield the outline without one of its teeth: two short sides that stick out into a gap."""
+    done: set[int] = set()
+    for loop in sides.loops:
+        count = len(loop.sides)
+        for k in range(count if count > 5 else 0):
+            before, first, second, after = (loop.sides[(k + j) % count] for j in range(4))
+            names = {first.key, first.twin, second.key, second.twin} - {-1}
+            if not (first.free and second.free) or names & (done | {before.key, after.key}):
+                continue
+            lengths = _length(sides, first.key), _length(sides, second.key)
+            tip = turn_between(unit(first.angle), unit(second.angle))
+            along = (
+                direction(one.curve, 0.5) if one.curve else unit(one.angle)
+                for one in (before, after)
+            )
+            if (
+                tip > TIP
+                and max(lengths) < TOOTH * limits.cell
+                and abs(turn_between(*along)) < FLAT
+            ):
+                done |= names
+                yield from _without(sides, names, limits, outer)
 
 
 def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
     """Yield the outline without one of what its limits hold at its least."""
+    yield from without_teeth(sides, limits, outer)
     done: set[int] = set()
     for loop in sides.loops:
         count = len(loop.sides)
