@@ -207,6 +207,7 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 TURN = 0.6  # of the outline along a side of a cell, rad, but where a finer one is asked for
 FINE = 0.2  # rad, there; halved for every further time
+PLATE_TURN = 0.9  # the same of plates in space, whose cells are as long as they are thick
 LARGEST = 2.5  # side of a cell, cells of the design
 SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
@@ -221,6 +222,7 @@ def body_mesh(
     cell: float,
     coarser: float = 1.0,
     finer: Sequence[np.ndarray] | None = (),
+    turn: float = TURN,
 ) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
@@ -230,12 +232,14 @@ def body_mesh(
         coarser: factor of the sides of all triangles.
         finer: places (n, 2), m, near which sides are half as long, and the outline turns by `FINE`
             along them; half of both for every further array. None: it does so everywhere.
+        turn: of the outline along a side elsewhere, rad.
 
     Raises:
         InputError: straight sides along its curves cross each other, however short.
     """
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = _sizes(shape, samples, cell, finer)
+    turn = FINE if finer is None else turn
+    sizes = _sizes(shape, samples, cell, finer or (), turn)
     for _ in range(FINER):
         outline = _outline(shape, samples, [coarser * size for size in sizes])
         if outline.is_simple:  # Gmsh would end the process
@@ -315,7 +319,8 @@ def _sizes(
     shape: Shape,
     samples: Sequence[np.ndarray],
     cell: float,
-    finer: Sequence[np.ndarray] | None,
+    finer: Sequence[np.ndarray],
+    turn: float,
 ) -> list[np.ndarray]:
     """Return the wanted sides of cells at the samples of every piece, m."""
     curves = shape.curves
@@ -325,8 +330,8 @@ def _sizes(
     bend = np.maximum(bend, 1e-9 / cell)
     apart, near = cKDTree(points).query(points, k=min(NEAREST, len(points)))
     side = np.minimum(_widths(points, inward, near), LARGEST * cell)  # one cell across a member
-    turns = np.full(len(points), FINE if finer is None else TURN)
-    for number, places in enumerate(finer or ()):
+    turns = np.full(len(points), turn)
+    for number, places in enumerate(finer):
         size = np.minimum(side, turns / bend)
         here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)
         turns = np.where(here, np.minimum(turns, FINE * 0.5**number), turns)
@@ -361,12 +366,11 @@ def _divided(curve: Curve, t: np.ndarray, size: np.ndarray) -> tuple[np.ndarray,
     """Return parameters of nodes along a curve, ends included, and sizes at all but the last."""
     step = np.linalg.norm(np.diff(curve.at(t), axis=0), axis=1)
     passed = np.append(0.0, np.cumsum(step * 0.5 * (1.0 / size[:-1] + 1.0 / size[1:])))
-    count = int(np.ceil(passed[-1] - 0.2))
     if isinstance(curve, Arc):
         # Evenly: the area is exact then, see `outline_places`.
-        at = np.linspace(0.0, 1.0, max(count, 1) + 1)
+        at = np.linspace(0.0, 1.0, int(np.ceil(passed[-1] - 1e-9)) + 1)
     else:
-        count = max(count, 2 if isinstance(curve, Spline) else 1)
+        count = max(int(np.ceil(passed[-1] - 0.2)), 2 if isinstance(curve, Spline) else 1)
         at = np.interp(np.linspace(0.0, passed[-1], count + 1), passed, t)
     at[0], at[-1] = 0.0, 1.0
     return at, np.interp(at[:-1], t, size)
@@ -511,7 +515,7 @@ class PlateMesh(Tetrahedra):
 
 def _plate_mesh(flat: PlanePart, size: float) -> PlateMesh:
     thickness = flat.domain.thickness
-    face = body_mesh(flat.shape, flat.domain.cell, size / flat.domain.cell)
+    face = body_mesh(flat.shape, flat.domain.cell, size / flat.domain.cell, turn=PLATE_TURN)
     return extruded(face, thickness, max(1, round(thickness / size)))
 
 

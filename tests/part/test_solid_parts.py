@@ -126,7 +126,7 @@ def test_mesh_of_a_part(domain_with, plate):
     part = make_solid_part(domain_with(windows, plate=plate))
     assert (part.flat is not None) == plate
     mesh = solid_mesh(part, 1.5 * mesh_size(part))
-    assert mesh.volumes.min() > 0.0 and mesh.quality.min() > 0.03 and mesh.quality.mean() > 0.55
+    assert mesh.volumes.min() > 0.0 and mesh.quality.min() > 0.03 and mesh.quality.mean() > 0.6
     assert mesh.volumes.sum() == pytest.approx(part.volume, rel=1e-6)
     for facets, x in ((mesh.inboard, 0.0), (mesh.outboard, LENGTH)):
         corners = mesh.points[facets]
@@ -479,7 +479,7 @@ def test_table_of_densities_and_parts(checked):
         assert table[name]["part"] == pytest.approx(table[name]["density"], rel=near), name
     check = checked[1]["check"]
     assert check["tetrahedra"]["link1"] > 300
-    assert 0.005 < check["refinement"]["compliance"] < 0.2
+    assert 1e-4 < abs(check["refinement"]["compliance"]) < 0.2
     assert len(check["stress"]["part"]["place"]) == 3
     limit = check["limits"]["deviation"]
     assert not limit["met"] and limit["value"] == table["deviation"]["part"]

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 
 FURTHEST = 0.5  # cells that a point of the part may be from where the isosurface has it
+LEAST_SHARE = 0.2  # of the smoothing that is left, below which all of it is taken back
 HELD = 0.9  # of the mark of what stays solid, from which on points belong to its faces
 NARROW = 0.9  # of the width asked for, below which a member or gap is told
 
@@ -298,18 +299,18 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
 def _uncrossed(surface: Surface, smooth: Surface, free: np.ndarray, volume: float) -> Surface:
     """Return the smoothed surface with a volume, less smooth where it would cross itself."""
     # The isosurface does not cross itself. Points of triangles that do go back towards it by
-    # halves, those beside them with them; the others make up for the volume. `free` (n,) is True
-    # of points that move.
+    # halves, those beside them with them, and all the way at last; the others make up for the
+    # volume. `free` (n,) is True of points that move.
     share = np.ones(len(surface.points))
     move = smooth.points - surface.points
     for _ in range(ROUNDS):
         now = replace(surface, points=surface.points + share[:, None] * move)
-        found = with_volume(now, free, volume)
+        found = with_volume(now, free & (share > 0.0), volume)
         crossed = crossings(found)
         if not len(crossed):
             break
         near = np.zeros(len(share), dtype=bool)
         near[surface.triangles[crossed]] = True
         near[surface.triangles[near[surface.triangles].any(axis=1)]] = True
-        share = np.where(near, 0.5 * share, share)
+        share = np.where(near, np.where(share > LEAST_SHARE, 0.5 * share, 0.0), share)
     return found
