@@ -46,22 +46,22 @@ def lowest_buckling(
         known: on other meshes: its arm is looked at, at its instant alone.
     """
     scene, motions = next(iter(arms.values())).scene, motions_of(trajectory)
-    found = []
+    result = []
     for k, loads in arm_loads(scene, motions).items():
         if known is not None:
             here = known.place, known.motion
             n = int(np.argmin(np.abs(motions[known.motion].t - known.instant)))
-            loads = [one.at(np.array([n])) for one in loads if (one.place, one.motion) == here]
+            loads = [item.at(np.array([n])) for item in loads if (item.place, item.motion) == here]
         if not loads:
             continue
         # All motions one after the other: what is worst along one tells of the others, too.
-        whole = np.concatenate([one.coefficients / one.stiffer for one in loads])
-        of = np.repeat(range(len(loads)), [len(one.instants) for one in loads])
+        whole = np.concatenate([item.coefficients / item.stiffer for item in loads])
+        of = np.repeat(range(len(loads)), [len(item.instants) for item in loads])
         every = replace(loads[0], coefficients=whole, stiffer=1.0, instants=np.arange(len(whole)))
         for each in pressed(arms[k].current, every):
-            one = loads[of[each.instant]]
-            n = one.instants[each.instant - int(np.argmax(of == of[each.instant]))]
-            mu, t = float(each.modes.inverse[0]), float(motions[one.motion].t[n])
+            load = loads[of[each.instant]]
+            n = load.instants[each.instant - int(np.argmax(of == of[each.instant]))]
+            mu, t = float(each.modes.inverse[0]), float(motions[load.motion].t[n])
             factor = 1.0 / mu if mu * LARGEST_FACTOR > 1.0 else float("inf")
-            found.append(LeastBuckling(factor, one.place, t, one.motion))
-    return min(found, key=lambda one: one.factor, default=None)
+            result.append(LeastBuckling(factor, load.place, t, load.motion))
+    return min(result, key=lambda item: item.factor, default=None)

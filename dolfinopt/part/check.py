@@ -192,39 +192,39 @@ def crisp(x_phys: np.ndarray, area: np.ndarray) -> np.ndarray:
 # -- their figures -----------------------------------------------------------------------------
 
 
-def _design_column(one: Simulated) -> Column:
+def _design_column(simulated: Simulated) -> Column:
     stress: Mapping[int, ArmStress] = stress_report(
-        one.partition, one.arms, one.trajectory, Profile()
+        simulated.partition, simulated.arms, simulated.trajectory, Profile()
     )
-    peak, arm = largest_of({place: each.peak for place, each in stress.items()}, one.scene)
-    return column_of(one, peak, arm)
+    peak, arm = largest_of({place: each.peak for place, each in stress.items()}, simulated.scene)
+    return column_of(simulated, peak, arm)
 
 
 def part_column(
-    scene: Scene, one: Simulated, parts: Mapping[int, Part]
+    scene: Scene, simulated: Simulated, parts: Mapping[int, Part]
 ) -> tuple[Column, dict[int, PartStress]]:
     """Return the figures of a machine with parts, and their stress by their place in the chain."""
-    found = stress_of_parts(one.arms, one.trajectory, parts)
-    peak, arm = largest_of({place: each.peak for place, each in found.items()}, scene)
-    return column_of(one, peak, arm), found
+    result = stress_of_parts(simulated.arms, simulated.trajectory, parts)
+    peak, arm = largest_of({place: each.peak for place, each in result.items()}, scene)
+    return column_of(simulated, peak, arm), result
 
 
-def _with_buckling(one: Simulated, larger: Simulated | None, column: Column) -> Column:
+def _with_buckling(simulated: Simulated, larger: Simulated | None, column: Column) -> Column:
     """Return the figures of plates with the lowest buckling factor."""
     if BUCKLING not in column.values:
         return column
     # Larger cells tell which arm buckles first, and when.
     known = None if larger is None else lowest_buckling(larger.arms, larger.trajectory)
-    found = lowest_buckling(one.arms, one.trajectory, known)
-    factor = float("nan") if found is None else found.factor
-    return replace(column, values={**column.values, BUCKLING: factor}, buckling=found)
+    result = lowest_buckling(simulated.arms, simulated.trajectory, known)
+    factor = float("nan") if result is None else result.factor
+    return replace(column, values={**column.values, BUCKLING: factor}, buckling=result)
 
 
-def column_of(one: Simulated, peak: Peak | None, arm: str) -> Column:
+def column_of(simulated: Simulated, peak: Peak | None, arm: str) -> Column:
     """Return the figures of a machine whose largest stress is known, with the arm that has it."""
     limits = [
         limit
-        for limit in limits_of(one.scene, one.evaluation)
+        for limit in limits_of(simulated.scene, simulated.evaluation)
         if limit.quantity != "volume_fraction"
     ]
     if peak is not None:  # of parts that of the outline, not of the centres of triangles
@@ -232,15 +232,17 @@ def column_of(one: Simulated, peak: Peak | None, arm: str) -> Column:
             replace(limit, value=peak.value) if limit.quantity == STRESS else limit
             for limit in limits
         ]
-    values = dict(_values(one, float("nan") if peak is None else peak.value))
-    if not any(arm.is_solid for arm in one.scene.arms):  # one mesh is enough
+    values = dict(_values(simulated, float("nan") if peak is None else peak.value))
+    if not any(arm.is_solid for arm in simulated.scene.arms):  # one mesh is enough
         values[BUCKLING] = float("nan")
-    return Column(values, one.evaluation.objective, peak, arm, tuple(limits), one.trajectory)
+    return Column(
+        values, simulated.evaluation.objective, peak, arm, tuple(limits), simulated.trajectory
+    )
 
 
-def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
+def _values(simulated: Simulated, stress: float) -> Iterator[tuple[str, float]]:
     """Yield the figures of a design, in the order of the table's rows."""
-    scene, motion, found = one.scene, one.trajectory, one.evaluation
+    scene, motion, result = simulated.scene, simulated.trajectory, simulated.evaluation
     bodies = motion.mechanism.bodies
     own = [k for k, owner in enumerate(scene.owners) if owner is not None]
     yield "mass", sum(bodies[k].mass for k in own)
@@ -250,7 +252,7 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
     for k in own:
         owner = scene.owners[k]
         assert owner is not None
-        frequency = one.arms[owner].state(one.x_phys[owner]).first_frequency
+        frequency = simulated.arms[owner].state(simulated.x_phys[owner]).first_frequency
         yield f"first_frequency_{scene.arms[k].name}", frequency
     if scene.objective.response.name not in (
         "esl",
@@ -261,16 +263,16 @@ def _values(one: Simulated, stress: float) -> Iterator[tuple[str, float]]:
         "orientation",
         STRESS,
     ):
-        yield "objective", found.objective
-    yield "compliance", found.compliance
+        yield "objective", result.objective
+    yield "compliance", result.compliance
     if not scene.is_pinned:
-        yield "deviation", found.max_deviation
+        yield "deviation", result.max_deviation
         yield "settling", motion.settling
     yield "orientation", motion.max_rotation
     peak, _ = motion.drives
     for name, value in zip(scene.driven, peak[scene.driven_columns], strict=True):
         yield f"drive_peak_{name}", float(value)
-    for number, (other, figures) in enumerate(zip(motion.scenarios, found.scenarios), 1):
+    for number, (other, figures) in enumerate(zip(motion.scenarios, result.scenarios), 1):
         yield f"compliance_scenario_{number}", figures.compliance
         if not scene.is_pinned:
             yield f"deviation_scenario_{number}", figures.max_deviation
@@ -349,8 +351,8 @@ class Check:
     @property
     def columns(self) -> dict[str, Column]:
         """The forms by their names."""
-        found = {DENSITY: self.density, CRISP: self.crisp, PART: self.before, self.form: self.part}
-        return {name: one for name, one in found.items() if one is not None}
+        result = {DENSITY: self.density, CRISP: self.crisp, PART: self.before, self.form: self.part}
+        return {name: item for name, item in result.items() if item is not None}
 
     def table(self) -> DataFrame:
         """Return a row a figure: unit, every form, and the last one less density and crisp.
@@ -378,11 +380,11 @@ class Check:
 
         That of the whole mesh; of stress by the last one where it is largest. NaN: not known.
         """
-        found = dict.fromkeys(self.units, float("nan"))
+        result = dict.fromkeys(self.units, float("nan"))
         if self.coarse is not None:
             for name in self.units:
-                found[name] = _ratio(self.part.values[name], self.coarse.values[name]) - 1.0
-        return found | {STRESS: self.stress_change}
+                result[name] = _ratio(self.part.values[name], self.coarse.values[name]) - 1.0
+        return result | {STRESS: self.stress_change}
 
     @property
     def converged(self) -> bool:
@@ -397,8 +399,8 @@ class Check:
     @property
     def stress_converged(self) -> bool:
         """Whether the part's largest stress does not depend on the mesh."""
-        limited = any(one.quantity == STRESS for one in self.part.limits)
-        refines = all(one.kind == "triangles" for one in self.meshes.values())
+        limited = any(limit.quantity == STRESS for limit in self.part.limits)
+        refines = all(mesh.kind == "triangles" for mesh in self.meshes.values())
         settled = SETTLED_LIMITED if limited and refines else SETTLED_STRESS
         return self.part.stress is None or abs(self.refinement[STRESS]) <= settled
 
@@ -424,93 +426,96 @@ class Check:
     @property
     def notes(self) -> list[str]:
         """What is said of the mesh and of stress, a sentence each."""
-        found = []
+        result = []
         if self.coarse is not None:
             change = ", ".join(
                 f"{name} by {_percent(100.0 * self.refinement[name])}"
                 for name in (*self._judged, *([] if self.part.stress is None else [STRESS]))
             )
-            found.append(f"mesh: the last refinement changed {change}")
+            result.append(f"mesh: the last refinement changed {change}")
         if self.part.stress is not None:
-            found.append(
+            result.append(
                 f"largest stress of the part: {_told(self.part.stress, self.part.stressed)}"
             )
-        return [*found, *unjudged(self.part.trajectory.scene)]
+        return [*result, *unjudged(self.part.trajectory.scene)]
 
     @property
     def warnings(self) -> list[str]:
         """What makes the figures doubtful, a sentence each."""
-        found = []
+        result = []
         softer = _ratio(self.part.values["compliance"], self.density.values["compliance"]) - 1.0
         aimed = self.before is not None and bool(self.part.limits)
-        if softer > LOST and not (aimed and all(one.met for one in self.part.limits)):
-            found.append(
+        if softer > LOST and not (aimed and all(limit.met for limit in self.part.limits)):
+            result.append(
                 f"the machine with the parts is {100.0 * softer:.2g} % softer than with the "
                 "densities; see part.png, and make the design crisp (design.projection) or its "
                 "cells finer"
             )
         if self.coarse is None:
-            found.append(
+            result.append(
                 "how far figures of the part depend on the mesh is not known: Gmsh cannot mesh it "
                 "with larger cells; simulate part.toml with finer ones, or ask for thicker members "
                 "(part.minimum_member)"
             )
         elif not self.converged:
-            found.append(
+            result.append(
                 f"the part's {' or '.join(self._judged)} still depends on the mesh: "
                 f"{self.notes[0].removeprefix('mesh: ')}"
             )
         if self.coarse is not None and not self.stress_converged:
-            found.append(
+            result.append(
                 "the part's largest stress is not converged: the last refinement changed it by "
                 f"{_percent(100.0 * self.refinement[STRESS])}"
             )
         if self.singular is not None:
-            found.append(
+            result.append(
                 f"stress of the part has no limit at {_told(self.singular, self.singular_arm)}: "
                 "at a re-entrant corner or the end of a rigid interface it grows with every "
                 "refinement; give it a radius, or judge it by the load of the joint"
             )
         buckling = self.part.buckling
         if buckling is not None and buckling.factor < SAFE:
-            found.append(
+            result.append(
                 f"{self.part.trajectory.scene.arms[buckling.place].name} buckles at "
                 f"{buckling.factor:.3g} times its loads at {buckling.instant:.3f} s: make its "
                 "struts shorter or thicker (design.minimum_member)"
             )
         if self.crisp is None and not self.density.trajectory.scene.has_walls:
-            found.append(
+            result.append(
                 "the design cut at the density that keeps the volume falls apart, or is far less "
                 "stiff: it is left out of the table"
             )
-        found += [
-            f"the part misses a limit: {one.sentence}" for one in self.part.limits if not one.met
+        result += [
+            f"the part misses a limit: {limit.sentence}"
+            for limit in self.part.limits
+            if not limit.met
         ]
-        return found
+        return result
 
     def _cells(self) -> dict[str, dict[str, int]]:
         """Return the number of cells of the parts by their kind and the arm's name."""
-        scene, found = self.part.trajectory.scene, dict[str, dict[str, int]]()
+        scene, result = self.part.trajectory.scene, dict[str, dict[str, int]]()
         for k, mesh in self.meshes.items():
-            found.setdefault(mesh.kind, {})[scene.arms[k].name] = len(mesh.cells)
-        return found
+            result.setdefault(mesh.kind, {})[scene.arms[k].name] = len(mesh.cells)
+        return result
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entries of part.json."""
         table = {
-            name: {"unit": unit} | {form: one.values[name] for form, one in self.columns.items()}
+            name: {"unit": unit}
+            | {form: column.values[name] for form, column in self.columns.items()}
             for name, unit in self.units.items()
         }
         places = {
-            form: one.stress.to_dict(one.stressed)
-            for form, one in self.columns.items()
-            if one.stress is not None
+            form: column.stress.to_dict(column.stressed)
+            for form, column in self.columns.items()
+            if column.stress is not None
         }
         limits = {
             limit.name: limit.to_dict() | {"excess": limit.excess} for limit in self.part.limits
         }
         singular = None if self.singular is None else self.singular.to_dict(self.singular_arm)
-        found = {
+        result = {
             "table": table,
             "check": {
                 "loss": self.loss,
@@ -524,13 +529,13 @@ class Check:
                 "warnings": self.warnings,
             },
         }
-        return dict(_finite(found))
+        return dict(_finite(result))
 
 
 def _finite(value: Any) -> Any:
     """Return JSON data without numbers that JSON does not have."""
     if isinstance(value, Mapping):
-        return {key: _finite(one) for key, one in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
@@ -569,7 +574,7 @@ def refined(
         refinement, and the meshes.
     """
     places: dict[int, list[np.ndarray]] = {k: [] for k in parts}
-    most = max((one.REFINEMENTS for one in parts.values()), default=0)
+    most = max((item.REFINEMENTS for item in parts.values()), default=0)
     limited = most and scene.constraints.limit(STRESS) is not None
     settled = SETTLED_LIMITED if limited else SETTLED_STRESS
     for round_ in range(most + 1):
@@ -583,10 +588,10 @@ def refined(
         known = column.stress is None or (round_ > 0 and not abs(change) > settled)
         if round_ == most or known:
             break
-        for place, one in stress.items():
+        for place, item in stress.items():
             owner = scene.owners[place]
-            if owner is not None and one.peak.value > HOT * column.values[STRESS]:
-                places[owner].append(one.hot)
+            if owner is not None and item.peak.value > HOT * column.values[STRESS]:
+                places[owner].append(item.hot)
         before = column
     return fine, column, stress, change, meshes
 
@@ -625,8 +630,8 @@ def check_parts(
     say("the machine with the parts")
     fine, column, stress, change, bodies = refined(scene, parts, meshes.fine, coarse)
     column = _with_buckling(fine, larger, column)
-    cells = {place: one.cells for place, one in stress.items()}
-    worst, at = largest_of({place: one.everywhere for place, one in stress.items()}, scene)
+    cells = {place: item.cells for place, item in stress.items()}
+    worst, at = largest_of({place: item.everywhere for place, item in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value
     return Check(
         units=units_of(scene, column),

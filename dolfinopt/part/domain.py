@@ -50,7 +50,7 @@ def loops(sides: np.ndarray) -> list[np.ndarray]:
     ahead: dict[int, list[int]] = {}
     for a, b in sides:
         ahead.setdefault(int(a), []).append(int(b))
-    found = []
+    result = []
     while ahead:
         first = next(iter(ahead))
         loop, node = [], first
@@ -61,8 +61,8 @@ def loops(sides: np.ndarray) -> list[np.ndarray]:
             if not after:
                 del ahead[node]
             node = node_after
-        found.append(np.array(loop))
-    return found
+        result.append(np.array(loop))
+    return result
 
 
 def recognise(points: np.ndarray, labels: np.ndarray, extent: float) -> list[Edge]:
@@ -114,8 +114,8 @@ def _longest(points: np.ndarray, near: float) -> tuple[int, Curve]:
         low, high = count, len(points)
         while low < high:
             middle = (low + high + 1) // 2
-            found = _circle(points[:middle], near) if fits else _straight(points[:middle], near)
-            low, high = (middle, high) if found else (low, middle - 1)
+            result = _circle(points[:middle], near) if fits else _straight(points[:middle], near)
+            low, high = (middle, high) if result else (low, middle - 1)
         return low
 
     straight = reach(False, 2)
@@ -158,7 +158,7 @@ def _smoothed(
     points: np.ndarray, halt: np.ndarray, edges: list[Edge], spans: list[tuple[int, int]]
 ) -> list[Edge]:
     """Put splines in place of three and more single sides that turn gently."""
-    found: list[Edge] = []
+    result: list[Edge] = []
     k = 0
     while k < len(edges):
         last = k
@@ -171,11 +171,11 @@ def _smoothed(
             last += 1
         if last - k >= 2:
             run = points[spans[k][0] : spans[last][1] + 1]
-            found.append(Edge(_through(run), edges[k].label))
+            result.append(Edge(_through(run), edges[k].label))
         else:
-            found += edges[k : last + 1]
+            result += edges[k : last + 1]
         k = last + 1
-    return found
+    return result
 
 
 def _through(points: np.ndarray) -> Spline:
@@ -215,7 +215,7 @@ class Region:
     def edges(self) -> list[Edge]:
         """All curves."""
         own = [edge for loop in self.loops for edge in loop]
-        return [*own, *(edge for one in self.others for edge in one.edges)]
+        return [*own, *(edge for other in self.others for edge in other.edges)]
 
     def area_inside(self, tolerance: float) -> Geometry:
         """Return the region as polygons whose sides stay within a distance of the curves, m."""
@@ -225,9 +225,9 @@ class Region:
         lines = [shapely.LinearRing(ring) for ring in rings]
         # Even-odd: a loop within another one is a hole.
         whole = shapely.Polygon()
-        for line in sorted(lines, key=lambda one: -shapely.Polygon(one).area):
+        for line in sorted(lines, key=lambda item: -shapely.Polygon(item).area):
             whole = whole.symmetric_difference(shapely.Polygon(line))
-        return shapely.union_all([whole, *(one.area_inside(tolerance) for one in self.others)])
+        return shapely.union_all([whole, *(other.area_inside(tolerance) for other in self.others)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,11 +300,11 @@ def _boundary(
     label[np.isin(facet, mesh.inboard_facets)] = INBOARD
     label[np.isin(facet, mesh.outboard_facets)] = OUTBOARD
     of = {(int(a), int(b)): name for (a, b), name in zip(ends, label, strict=True)}
-    found = []
+    result = []
     for loop in loops(ends):
         sides = zip(loop, np.roll(loop, -1), strict=True)
-        found.append((loop, np.array([of[int(a), int(b)] for a, b in sides])))
-    return found
+        result.append((loop, np.array([of[int(a), int(b)] for a, b in sides])))
+    return result
 
 
 def _kept(
@@ -319,21 +319,21 @@ def _stated(
     arm: Arm, kind: RegionKind, outline: Region, centroid: np.ndarray
 ) -> tuple[np.ndarray, list[Region]]:
     """Return which cells (n,) the scene's lengths and regions keep, and their exact shapes."""
-    found, shapes = np.zeros(len(centroid), dtype=bool), []
-    for one in arm.regions:
-        if one.kind == kind and one.depth is None:
+    result, shapes = np.zeros(len(centroid), dtype=bool), []
+    for region in arm.regions:
+        if region.kind == kind and region.depth is None:
             for mirror in (1.0, -1.0) if arm.symmetric_about[0] else (1.0,):
-                found |= one.covers(centroid[:, 0], mirror * centroid[:, 1])
-                shapes.append(Region([_shape(one, mirror)]))
+                result |= region.covers(centroid[:, 0], mirror * centroid[:, 1])
+                shapes.append(Region([_shape(region, mirror)]))
     if kind == "solid" and arm.cells is None and arm.solid_ends > 0.0:
         for edge in outline.edges:
             ring = edge.curve
             if edge.label and isinstance(ring, Arc) and ring.is_circle:
                 radius = ring.radius + arm.solid_ends
-                found |= np.linalg.norm(centroid - ring.centre, axis=1) < radius
+                result |= np.linalg.norm(centroid - ring.centre, axis=1) < radius
                 circle = Arc(ring.centre, radius, 0.0, 2.0 * np.pi)
                 shapes.append(Region([[Edge(circle, "")]]))
-    return found, shapes
+    return result, shapes
 
 
 def _shape(region: Box, mirror: float) -> list[Edge]:
@@ -352,9 +352,9 @@ def _without_kept(mesh: ArmMesh, kept: np.ndarray, field: np.ndarray) -> np.ndar
     if not kept.any() or kept.all():
         return field
     nearest = cKDTree(mesh.centroid[~kept]).query(mesh.centroid[kept])[1]
-    found = field.copy()
-    found[kept] = field[~kept][nearest]
-    return found
+    result = field.copy()
+    result[kept] = field[~kept][nearest]
+    return result
 
 
 class Filled:
@@ -683,7 +683,7 @@ def solid_domain(mesh: ArmMesh, x_phys: np.ndarray, field: np.ndarray | None = N
         outboard,
         kept,
         crisp=field is None,
-        further={one.name: faces[np.isin(facets, one.facets)] for one in mesh.further},
+        further={item.name: faces[np.isin(facets, item.facets)] for item in mesh.further},
         void=float(mesh.area[mesh.void].sum()),
     )
 

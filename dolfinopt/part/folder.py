@@ -193,8 +193,10 @@ def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[st
             name = scene.arms[owner].name if arm.design else arm.name
             row.update(_meshed(meshes.absolute() / f"{name}.msh") | parts[owner].keys())
             row["interfaces"] = [
-                {"name": one.name, "point": list(point)}
-                for one, point in zip(arm.further_interfaces, arm.interface_points[1:], strict=True)
+                {"name": interface.name, "point": list(point)}
+                for interface, point in zip(
+                    arm.further_interfaces, arm.interface_points[1:], strict=True
+                )
             ]
     # All of it stays solid; what else there is to say of a design has no use.
     data["design"] = {"volume_fraction": 1.0, "initial": 1.0, "filter_radius": 0.0}
@@ -281,12 +283,15 @@ class Checkpoint:
 
     def replace(self, searches: Sequence[Saved]) -> None:
         """Write where the searches from all starts so far are."""
-        told = [[one.start, one.done, one.ending, dict(one.tightened)] for one in searches]
+        told = [
+            [search.start, search.done, search.ending, dict(search.tightened)]
+            for search in searches
+        ]
         arrays = {"question": np.array(self.question), "searches": np.array(json.dumps(told))}
-        for one in searches:
-            for kind, forms in (("forms", one.forms), ("best", one.best)):
+        for search in searches:
+            for kind, forms in (("forms", search.forms), ("best", search.best)):
                 for k, form in forms.items():
-                    arrays |= {f"{one.start}/{kind}/{k}/{name}": a for name, a in form.items()}
+                    arrays |= {f"{search.start}/{kind}/{k}/{name}": a for name, a in form.items()}
         prepare_folder(self.folder)
         write_arrays(self.folder / SHAPES, arrays)
 
@@ -304,12 +309,12 @@ class Checkpoint:
             raise InputError(f"{path}: --resume: of another design, or other options; {remedy}")
 
         def forms(start: int, kind: str) -> Forms:
-            found: dict[int, dict[str, np.ndarray]] = {}
+            result: dict[int, dict[str, np.ndarray]] = {}
             for key, array in arrays.items():
                 if key.startswith(f"{start}/{kind}/"):
                     _, _, k, name = key.split("/", 3)
-                    found.setdefault(int(k), {})[name] = array
-            return found
+                    result.setdefault(int(k), {})[name] = array
+            return result
 
         return tuple(
             Saved(start, done, ending, tightened, forms(start, "forms"), forms(start, "best"))

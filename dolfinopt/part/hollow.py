@@ -159,8 +159,8 @@ class HollowPart:
             outer, inner = map(_halved, grid)
             still = np.zeros_like(outer), np.arange(outer.shape[1])
             hull, thickness = Hull(outer, inner - outer, *still), np.ones(outer.shape[:2])
-        found = hull.member(thickness)
-        return WallMesh(found.points, found.cells, found.inboard, found.outboard)
+        result = hull.member(thickness)
+        return WallMesh(result.points, result.cells, result.inboard, result.outboard)
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
         """Return which places (n, 3) are away from where stress has no limit (n,).
@@ -169,15 +169,15 @@ class HollowPart:
         """
         x = self.hull.outer[:, 0, 0]
         far = max(margin, EDGE_DISTANCE * float(np.median(np.diff(x))))
-        found = (places[:, 0] >= x[0] + far) & (places[:, 0] <= x[-1] - far)
+        result = (places[:, 0] >= x[0] + far) & (places[:, 0] <= x[-1] - far)
         # The mitre of a section that turns by 2 a is 1 / cos a.
         turn = 2.0 * np.arccos(1.0 / np.linalg.norm(self.hull.inward, axis=2).clip(1.0))
         edges = np.sin(turn) > REENTRANT_SINE
         if edges.any():
             inner = (self.hull.outer + self.thickness[:, :, None] * self.hull.inward)[edges]
             across = cKDTree(inner[:, 1:]).query(places[:, 1:])[0]
-            found &= across > EDGE_DISTANCE * self.thickness.min()
-        return np.asarray(found)
+            result &= across > EDGE_DISTANCE * self.thickness.min()
+        return np.asarray(result)
 
     def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
         """Return the stress at the corners of the cells, on both surfaces of the wall."""
@@ -200,15 +200,15 @@ def make_hollow_part(mesh: ArmMesh, x_phys: np.ndarray, curves: Curves = DEFAULT
     assert mesh.wall is not None
     wall = mesh.wall
     thickness = wall.thickness(mesh.comm, x_phys)
-    found = HollowPart(mesh.name, wall.hull, thickness, (wall.least, wall.most))
-    check_surface(mesh.name, found.surface)
-    return found
+    result = HollowPart(mesh.name, wall.hull, thickness, (wall.least, wall.most))
+    check_surface(mesh.name, result.surface)
+    return result
 
 
 def _halved(grid: np.ndarray) -> np.ndarray:
     """Return points (s, r, d), round a section, with those halfway along and round them."""
     along = np.empty((2 * len(grid) - 1, *grid.shape[1:]))
     along[::2], along[1::2] = grid, 0.5 * (grid[1:] + grid[:-1])
-    found = np.empty((len(along), 2 * grid.shape[1], grid.shape[2]))
-    found[:, ::2], found[:, 1::2] = along, 0.5 * (along + np.roll(along, -1, axis=1))
-    return found
+    result = np.empty((len(along), 2 * grid.shape[1], grid.shape[2]))
+    result[:, ::2], result[:, 1::2] = along, 0.5 * (along + np.roll(along, -1, axis=1))
+    return result

@@ -138,12 +138,12 @@ class BodyMesh:
             by_nodes: (m, n, 2) derivatives by the places of all nodes.
         """
         count = len(self.points)
-        found = np.moveaxis(by_nodes, 1, 0).reshape(count, -1).copy()
+        result = np.moveaxis(by_nodes, 1, 0).reshape(count, -1).copy()
         inner, laplacian = self._inner()
         if inner.any():
-            adjoint = splu(laplacian[inner][:, inner].tocsc()).solve(found[inner])
-            found[~inner] -= laplacian[inner][:, ~inner].T @ adjoint
-        whole = np.moveaxis(found.reshape(count, *by_nodes.shape[::2]), 0, 1)
+            adjoint = splu(laplacian[inner][:, inner].tocsc()).solve(result[inner])
+            result[~inner] -= laplacian[inner][:, ~inner].T @ adjoint
+        whole = np.moveaxis(result.reshape(count, *by_nodes.shape[::2]), 0, 1)
         return whole[:, self.sides[:, 0]]
 
     @property
@@ -282,12 +282,12 @@ class _Outline:
     @property
     def sides(self) -> np.ndarray:
         """Corners (k, 2) at the ends of all sides."""
-        found, first = [], 0
+        result, first = [], 0
         for loop in self.loops:
             corners = first + np.arange(len(loop))
-            found.append(np.stack([corners, np.roll(corners, -1)], axis=1))
+            result.append(np.stack([corners, np.roll(corners, -1)], axis=1))
             first += len(loop)
-        return np.vstack(found)
+        return np.vstack(result)
 
 
 def _outline(shape: Shape, samples: Sequence[np.ndarray], sizes: Sequence[np.ndarray]) -> _Outline:
@@ -295,9 +295,9 @@ def _outline(shape: Shape, samples: Sequence[np.ndarray], sizes: Sequence[np.nda
     number = 0
     for loop in shape.loops:
         corners = []
-        for one in loop:
-            t, h = _divided(one.curve, samples[number], sizes[number])
-            corners.append(one.curve.at(t[:-1]))
+        for item in loop:
+            t, h = _divided(item.curve, samples[number], sizes[number])
+            corners.append(item.curve.at(t[:-1]))
             piece.append(np.full(len(t) - 1, number))
             span.append(np.stack([t[:-1], t[1:]], axis=1))
             spacing.append(h)
@@ -485,12 +485,12 @@ def _with_further(domain: SolidDomain, mesh: Tetrahedra, size: float) -> Tetrahe
         return mesh
     facets = mesh.boundary
     middles = mesh.points[facets].mean(axis=1)
-    found = {}
+    result = {}
     for name, faces in domain.further.items():
-        found[name] = facets[distance_to_faces(middles, faces) < BESIDE * size]
-        if not len(found[name]):
+        result[name] = facets[distance_to_faces(middles, faces) < BESIDE * size]
+        if not len(result[name]):
             raise InputError(f"the {name} interface is lost in its faces")
-    return replace(mesh, further=found)
+    return replace(mesh, further=result)
 
 
 @dataclass(frozen=True, eq=False)
@@ -564,9 +564,9 @@ def _of_volume(part: SolidPart, mesh: Tetrahedra) -> Tetrahedra:
     free[rim] = distance_to_faces(mesh.points[rim], faces) > ROUNDING * domain.cell
     for _ in range(ROUNDS):
         moved = with_volume(Surface(mesh.points, facets), free, wanted)
-        found = replace(mesh, points=moved.points)
-        spoilt = (found.quality <= FOLDED) & (found.quality < mesh.quality)
+        result = replace(mesh, points=moved.points)
+        spoilt = (result.quality <= FOLDED) & (result.quality < mesh.quality)
         if not spoilt.any():
-            return found
+            return result
         free[mesh.cells[spoilt]] = False
     return mesh

@@ -68,14 +68,14 @@ class Found:
     @property
     def sentence(self) -> str:
         """What came out, in one line."""
-        missed = [one.sentence for one in self.limits if not one.met]
+        missed = [limit.sentence for limit in self.limits if not limit.met]
         kept = "; ".join(missed) if missed else "all limits kept"
         return f"{self.iterations} iterations ({self.ending}), objective {self.value:.4g}, {kept}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of part.json."""
         names = ("start", "iterations", "value", "ending")
-        met = all(one.met for one in self.limits)
+        met = all(limit.met for limit in self.limits)
         return {name: getattr(self, name) for name in names} | {"limits_met": met}
 
 
@@ -106,18 +106,18 @@ class Optimized:
     def sentences(self) -> list[str]:
         """What it brought, a line for every start, the one that is kept first."""
         first = f"shape optimisation, objective {self.before:.4g} before: from {self.best.start}"
-        rest = [f"not kept: from {one.start}: {one.sentence}" for one in self.others]
+        rest = [f"not kept: from {other.start}: {other.sentence}" for other in self.others]
         return [f"{first}: {self.best.sentence}", *rest]
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of part.json."""
-        one = self.best
+        best = self.best
         return {
-            "iterations": one.iterations,
+            "iterations": best.iterations,
             "before": self.before,
-            "after": one.value,
-            "ending": one.ending,
-            "start": one.start,
+            "after": best.value,
+            "ending": best.ending,
+            "start": best.start,
             "others": [other.to_dict() for other in self.others],
         }
 
@@ -158,11 +158,11 @@ def optimize_parts(
     one = _judged(scene, dict(parts)) if before is None else before
     given = Found("the parts themselves", dict(parts), 0, one.objective, one.limits, "as they were")
     outlines = {k: _free(scene, k, part) for k, part in owned.items()}
-    if not any(one.count for one in outlines.values()):
+    if not any(outline.count for outline in outlines.values()):
         raise InputError("--optimize: the parts have no free curves: nothing can move")
-    found: list[Found] = []
+    result: list[Found] = []
     interrupted = False
-    saved = {one.start: one for one in known}
+    saved = {item.start: item for item in known}
 
     def kept(one: Saved) -> None:
         saved[one.start] = one
@@ -174,33 +174,33 @@ def optimize_parts(
         descent = None
         try:
             if number:
-                plates = {k: one for k, one in owned.items() if isinstance(one, PlanePart)}
+                plates = {k: item for k, item in owned.items() if isinstance(item, PlanePart)}
                 trusses = trusses_of(plates, number - 1)
                 outlines = {k: _free(scene, k, part) for k, part in trusses.items()}
             if starts:
                 tell(f"from {name}")
             begun = Problem(scene, parts, {}), outlines, iterations, tell
             descent = Descent(*begun, number, kept, saved.get(number))
-            found.append(descent.found(name))
+            result.append(descent.found(name))
         except (ConvergenceError, InputError) as error:  # the parts as they were remain
             tell(f"from {name}: {error}")
         except KeyboardInterrupt:
             interrupted = True
             if descent is not None:
                 tell("interrupted: the best so far is judged and kept; once more gives it up")
-                found.append(descent.so_far(name))
+                result.append(descent.so_far(name))
             break
     gc.unfreeze()
-    best = min([given, *found], key=lambda one: _rank(scene, one))
-    others = tuple(one for one in found if one is not best)
+    best = min([given, *result], key=lambda item: _rank(scene, item))
+    others = tuple(item for item in result if item is not best)
     return Optimized(best, others, mesh_parts(best.parts), given.value, interrupted)
 
 
 def _free(scene: Scene, k: int, part: Part) -> FreeSides:
     """Return the sides of a part; no thinner than arms that repeat it smaller allow."""
     repeating = [scene.arms[j] for j, pattern in scene.patterns.items() if pattern == k]
-    one = scene.arms[k]
-    sizes = [s for a in repeating for s in (a.length / one.length, a.height / one.height)]
+    arm = scene.arms[k]
+    sizes = [s for a in repeating for s in (a.length / arm.length, a.height / arm.height)]
     flat = part.flat if isinstance(part, SolidPart) else part
     if not isinstance(flat, PlanePart):
         raise InputError(
@@ -219,19 +219,19 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
     with suppress(InputError):  # where few do not keep the limits, the part's own will do
         sides = fitted_sides(outline, limits, START * cell, sides.shape.area, hole)
     made = FreeSides(flat, sides, limits, solid)
-    found = made.nearest()
-    return (made if found is None else found[0]).simplified(without_teeth)[0]
+    result = made.nearest()
+    return (made if result is None else result[0]).simplified(without_teeth)[0]
 
 
 def _rank(scene: Scene, found: Found) -> tuple[float, float]:
     """Return what orders designs, best first: feasible ones by their objective, else by excess."""
-    excess = max((0.0 if one.met else one.excess for one in found.limits), default=0.0)
+    excess = max((0.0 if limit.met else limit.excess for limit in found.limits), default=0.0)
     return excess, -found.value if objective_of(scene).turned else found.value
 
 
 def _judged(scene: Scene, parts: dict[int, Part]) -> Column:
     """Return what parts do on refined meshes."""
-    refines = any(one.REFINEMENTS for one in parts.values())
+    refines = any(part.REFINEMENTS for part in parts.values())
     meshes = {} if refines else mesh_parts(parts, coarse=False).fine
     return refined(scene, parts, meshes, None)[1]
 
@@ -274,15 +274,15 @@ class Descent:
     def found(self, start: str) -> Found:
         """Search to the end, and return the best of what finer meshes have judged."""
         if self.forms:  # by an earlier call
-            found = self._judged(start, self.forms)
+            result = self._judged(start, self.forms)
             if self.ending:
-                return found
+                return result
         self.ending = self.search.run(self.iterations, self._told)
         for repairs in range(1 + REPAIRS):
-            found = self._judged(start, self.search.state.outlines, self.search.meshed)
-            if repairs == REPAIRS or all(one.met for one in found.limits):
+            result = self._judged(start, self.search.state.outlines, self.search.meshed)
+            if repairs == REPAIRS or all(limit.met for limit in result.limits):
                 break
-            self._repair(found.limits)
+            self._repair(result.limits)
         self._keep()
         assert self.best is not None
         return replace(self.best, iterations=self.search.steps, ending=self.ending)
@@ -290,7 +290,7 @@ class Descent:
     def _keep(self) -> None:
         """Say where the search is."""
         forms, best = (
-            {k: one.arrays for k, one in some.items()}
+            {k: item.arrays for k, item in some.items()}
             for some in (self.search.state.outlines, self.forms)
         )
         tightened = self.search.problem.tightened
@@ -319,15 +319,15 @@ class Descent:
         else:
             raise ConvergenceError("no parts of this search can be simulated")
         steps, value, limits = self.search.steps, column.objective, column.limits
-        found = Found(start, made, steps, value, limits, self.ending)
-        if self.best is None or _rank(scene, found) < _rank(scene, self.best):
-            self.best, self.forms = found, outlines
-        return found
+        result = Found(start, made, steps, value, limits, self.ending)
+        if self.best is None or _rank(scene, result) < _rank(scene, self.best):
+            self.best, self.forms = result, outlines
+        return result
 
     def _repair(self, limits: tuple[Limit, ...]) -> None:
         """Take a few more steps, which meet limits that are tighter by what is missed."""
-        missed = [one for one in limits if not one.met]
-        self.tell("tightened by what finer meshes show: " + ", ".join(one.name for one in missed))
+        missed = [limit for limit in limits if not limit.met]
+        self.tell("tightened by what finer meshes show: " + ", ".join(item.name for item in missed))
         problem = self.search.problem.tighter(missed)
         self.search = Search(problem, self.search.state, self.search.steps)
         self.search.restore(self._told)

@@ -111,19 +111,19 @@ class Problem:
 
     def every(self, outlines: Mapping[int, FreeSides]) -> dict[int, FreeSides]:
         """Return the outlines with those of arms that repeat them."""
-        found = dict(outlines)
+        result = dict(outlines)
         for k, pattern in self.scene.patterns.items():
-            found[k] = outlines[pattern].scaled(self.parts[k], self._factors(k))
-        return {k: found[k] for k in sorted(found)}
+            result[k] = outlines[pattern].scaled(self.parts[k], self._factors(k))
+        return {k: result[k] for k in sorted(result)}
 
     def parts_of(self, outlines: Mapping[int, FreeSides]) -> dict[int, Part]:
         """Return the parts of all arms with these outlines."""
-        return {k: one.current for k, one in self.every(outlines).items()}
+        return {k: item.current for k, item in self.every(outlines).items()}
 
     def _factors(self, k: int) -> np.ndarray:
         """Return the sizes of an arm over those of the one whose design it repeats."""
-        one, other = self.scene.arms[k], self.scene.arms[self.scene.patterns.get(k, k)]
-        return np.array([one.length / other.length, one.height / other.height])
+        arm, other = self.scene.arms[k], self.scene.arms[self.scene.patterns.get(k, k)]
+        return np.array([arm.length / other.length, arm.height / other.height])
 
     def evaluated(
         self, outlines: Mapping[int, FreeSides], bodies: Mapping[int, PartMesh], *start: Any
@@ -136,19 +136,21 @@ class Problem:
         """
         every = self.every(outlines)
         if not bodies:
-            bodies = {k: one.meshed(self.finer.get(k, ())) for k, one in every.items()}
-        parts = {k: one.current for k, one in every.items()}
+            bodies = {k: item.meshed(self.finer.get(k, ())) for k, item in every.items()}
+        parts = {k: item.current for k, item in every.items()}
         changes: dict[str, Any] = {"objective": {"gradient": "exact"}}
         if self.stiffening is not None:
             changes["simulation"] = {"stiffening": self.stiffening}
         if self.scene.constraints.limits.keys() - {STRESS}:
             changes["constraints"] = {STRESS: None}  # of parts it is that of the outline
         simulated = simulate_parts(self.scene, parts, bodies, *start, **changes)
-        found, rows = simulated.evaluation, []
-        limits = limits_of(simulated.scene, found)
-        for one, value, limit in zip(limits, found.constraints, found.smooth_limits, strict=True):
-            if one.quantity not in ("volume_fraction", STRESS):
-                rows.append(((1.0 + value) * limit, limit / self._factor(one)))
+        result, rows = simulated.evaluation, []
+        limits = limits_of(simulated.scene, result)
+        for item, value, limit in zip(
+            limits, result.constraints, result.smooth_limits, strict=True
+        ):
+            if item.quantity not in ("volume_fraction", STRESS):
+                rows.append(((1.0 + value) * limit, limit / self._factor(item)))
         smooth, held = np.array(rows).reshape(-1, 2).T
         shares = np.array([share for share, _ in self._volumes(outlines)])
         state = State(outlines, bodies, simulated, smooth, held, shares)
@@ -163,7 +165,7 @@ class Problem:
         for k, loads in arm_loads(scene, motions).items():
             now, part = state.simulated.arms[k].current, every[k].current
             points = part.stress(now, now.load_fields)
-            motion = [one.coefficients for one in loads]
+            motion = [load.coefficients for load in loads]
             stress = np.max([maxima(MPI.COMM_SELF, points.A, a)[0] for a in motion], axis=0)
             means_of = points.means(motion, self._exponent)
             face = _face(state.bodies[k])
@@ -186,19 +188,26 @@ class Problem:
 
     def stress_slopes(self, state: State, keys: Sequence[Place]) -> list[np.ndarray]:
         """Return the derivatives (n,) of `State.places` of some places."""
-        found = []
+        result = []
         for key in keys:
             stress, analysis = self._place_stress(state, key)
             (row,) = stress.gradients(analysis)
             scale = (1.0 + state.places[key]) / state.means[key]
-            found.append(self._by_x(state, [{k: scale * g for k, g in row.items()}])[0])
-        return found
+            result.append(self._by_x(state, [{k: scale * g for k, g in row.items()}])[0])
+        return result
 
     def _place_stress(self, state: State, key: Place) -> tuple[OutlineStress, Analysis]:
-        nodes, one = {key[0]: state.owners[key[0]] == key[1]}, state.simulated
+        nodes, simulated = {key[0]: state.owners[key[0]] == key[1]}, state.simulated
         parts = self.parts_of(state.outlines)
-        given = one.scene, one.partition, one.arms, one.trajectory, Profile(), by_nodes
-        options = one.scene.objective.unchecked_copy({"stress_exponent": self._exponent})
+        given = (
+            simulated.scene,
+            simulated.partition,
+            simulated.arms,
+            simulated.trajectory,
+            Profile(),
+            by_nodes,
+        )
+        options = simulated.scene.objective.unchecked_copy({"stress_exponent": self._exponent})
         return OutlineStress(options, parts, nodes), analysis_of(*given)
 
     def calibrated(self, state: State) -> tuple[Problem, State]:
@@ -224,13 +233,13 @@ class Problem:
         """Return the problem with limits that are tighter by what finer meshes miss."""
         # Lower limits count by their squares, as those of frequencies.
         tightened = {
-            one.name: self._factor(one) * (1.0 + one.excess) ** (2 if one.least else 1)
-            for one in missed
+            item.name: self._factor(item) * (1.0 + item.excess) ** (2 if item.least else 1)
+            for item in missed
         }
         return replace(self, tightened={**self.tightened, **tightened})
 
-    def _factor(self, one: Limit) -> float:
-        return self.tightened.get(one.name, 1.0 + RESERVE)
+    def _factor(self, limit: Limit) -> float:
+        return self.tightened.get(limit.name, 1.0 + RESERVE)
 
     @property
     def _exponent(self) -> float:
@@ -242,12 +251,12 @@ class Problem:
         if share is None:
             return []
         sizes, most, slopes, first = [], [], [], 0
-        count = sum(one.count for one in outlines.values())
-        for one in outlines.values():
-            domain, row = one.part.domain, np.zeros(count)
-            row[first : first + one.count] = domain.thickness * one.area_by_x()
-            first += one.count
-            sizes.append(domain.thickness * one.sides.shape.area)
+        count = sum(outline.count for outline in outlines.values())
+        for outline in outlines.values():
+            domain, row = outline.part.domain, np.zeros(count)
+            row[first : first + outline.count] = domain.thickness * outline.area_by_x()
+            first += outline.count
+            sizes.append(domain.thickness * outline.sides.shape.area)
             # What the densities have: sides may have begun a little above the limit.
             most.append(domain.thickness * max(share * domain.whole, domain.volume))
             slopes.append(row)
@@ -257,13 +266,13 @@ class Problem:
 
     def slopes(self, state: State) -> np.ndarray:
         """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""
-        one = state.simulated
-        given = one.scene, one.partition, one.arms, one.trajectory
+        simulated = state.simulated
+        given = simulated.scene, simulated.partition, simulated.arms, simulated.trajectory
         sign = -1.0 if objective_of(self.scene).turned else 1.0
         rows = [{k: sign * g for k, g in gradient(*given, Profile(), by=by_nodes).items()}]
-        every = limits_of(one.scene, one.evaluation)
-        found = constraint_gradients(*given, measured=one.evaluation.responses, by=by_nodes)
-        for limit, row in zip(every, found, strict=True):
+        every = limits_of(simulated.scene, simulated.evaluation)
+        result = constraint_gradients(*given, measured=simulated.evaluation.responses, by=by_nodes)
+        for limit, row in zip(every, result, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
         volumes = [row for _, row in self._volumes(state.outlines)]
@@ -271,7 +280,7 @@ class Problem:
 
     def _by_x(self, state: State, rows: list[dict[int, np.ndarray]]) -> np.ndarray:
         """Return derivatives (m, n) by x from those by the nodes of the arms' meshes."""
-        found = {k: np.zeros((len(rows), one.count)) for k, one in state.outlines.items()}
+        result = {k: np.zeros((len(rows), outline.count)) for k, outline in state.outlines.items()}
         every = self.every(state.outlines)
         for k, body in state.bodies.items():
             some = [number for number, row in enumerate(rows) if k in row]
@@ -280,8 +289,8 @@ class Problem:
             mesh = state.simulated.arms[k].mesh
             order = cKDTree(mesh.mesh.geometry.x[:, : mesh.dim]).query(body.points)[1]
             by_nodes = np.array([rows[number][k][order] for number in some])
-            found[self.scene.patterns.get(k, k)][some] += every[k].by_x(body, by_nodes)
-        return np.hstack([*found.values()])
+            result[self.scene.patterns.get(k, k)][some] += every[k].by_x(body, by_nodes)
+        return np.hstack([*result.values()])
 
 
 def _face(mesh: Any) -> BodyMesh:

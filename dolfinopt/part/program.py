@@ -63,9 +63,9 @@ def solve(
     by_z = solve_triangular(L, by_x.T, lower=True).T
     right = np.concatenate([-f, b, np.zeros(q), np.ones(2 * n)]) + by_z @ shift + by_s.sum(axis=1)
     size = float(np.hypot(np.linalg.norm(shift), np.linalg.norm(root * (1.0 + f.max(initial=0.0)))))
-    found = least_move(np.hstack([by_z, by_s / root]), right, size)
-    if found is None:
+    result = least_move(np.hstack([by_z, by_s / root]), right, size)
+    if result is None:
         return None
-    z, dual = found
+    z, dual = result
     x = solve_triangular(L.T, z[:n] - shift)
     return np.clip(x, -1.0, 1.0), dual[: len(f)]

@@ -48,11 +48,11 @@ def damped(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
         least = 0.05 * np.linalg.norm(s) * np.linalg.norm(y)
         H = max(float(s @ y), least) / (s @ s) * np.eye(len(s))
     Hs = H @ s
-    curve, found = float(s @ Hs), float(s @ y)
+    curve, result = float(s @ Hs), float(s @ y)
     if curve <= 0.0:
         return H
-    if found < 0.2 * curve:
-        share = 0.8 * curve / (curve - found)
+    if result < 0.2 * curve:
+        share = 0.8 * curve / (curve - result)
         y = share * y + (1.0 - share) * Hs
     return np.asarray(H - np.outer(Hs, Hs) / curve + np.outer(y, y) / (s @ y))
 
@@ -157,19 +157,19 @@ class Search:
     def _simplified(self) -> bool:
         """Go on without sides that have vanished and holes that close, if that costs little."""
         before = self.state
-        for k, one in before.outlines.items():
-            simpler, count = one.simplified()
+        for k, outline in before.outlines.items():
+            simpler, count = outline.simplified()
             if not count:
                 continue
             plain = replace(self.problem, local={})
             try:
                 outlines = {**self.state.outlines, k: simpler}
-                found = plain.evaluated(outlines, {}, self.state.solutions)
+                result = plain.evaluated(outlines, {}, self.state.solutions)
             except (ConvergenceError, InputError):
                 continue
-            cost = self._merit(found, found) - self._merit(self.state, self.state)
+            cost = self._merit(result, result) - self._merit(self.state, self.state)
             if cost < WORSE * np.sqrt(count) * abs(self.state.values[0]):
-                self.problem, self.state, self.before = plain, found, None
+                self.problem, self.state, self.before = plain, result, None
         return self.state is not before
 
     def _settled(self) -> bool:
@@ -178,12 +178,12 @@ class Search:
         )
 
     def _line(self) -> str:
-        one = self.state
-        missed = f"{100.0 * one.excess:.2g} % over a limit"
-        words = "limits met" if one.excess <= EXCESS else missed
+        state = self.state
+        missed = f"{100.0 * state.excess:.2g} % over a limit"
+        words = "limits met" if state.excess <= EXCESS else missed
         return (
-            f"{self.steps} objective {one.simulated.evaluation.objective:.5g}, "
-            f"mass {one.mass:.4g} kg, {words}, trust region {self.radius:.2g}"
+            f"{self.steps} objective {state.simulated.evaluation.objective:.5g}, "
+            f"mass {state.mass:.4g} kg, {words}, trust region {self.radius:.2g}"
         )
 
     # -- a step -----------------------------------------------------------------------------------
@@ -247,15 +247,15 @@ class Search:
     def _linear(self, state: State, slopes: np.ndarray) -> Linear:
         """Return the limits that a step of this radius can meet."""
         reach, far, A, b, first = self.radius * FAR, [], [], [], 0
-        for one in state.outlines.values():
-            g, own = one.rows()
-            near = g > -reach * one.cell * np.abs(own).sum(axis=1) - 0.1 * one.cell
+        for outline in state.outlines.values():
+            g, own = outline.rows()
+            near = g > -reach * outline.cell * np.abs(own).sum(axis=1) - 0.1 * outline.cell
             wide = np.zeros((int(near.sum()), slopes.shape[1]))
-            wide[:, first : first + one.count] = own[near]
-            A.append(wide / one.cell)
-            b.append(np.maximum(-g[near] / one.cell, 0.0))
-            first += one.count
-            far.append(np.full(one.count, reach * one.cell))
+            wide[:, first : first + outline.count] = own[near]
+            A.append(wide / outline.cell)
+            b.append(np.maximum(-g[near] / outline.cell, 0.0))
+            first += outline.count
+            far.append(np.full(outline.count, reach * outline.cell))
         hot = {key: row for key, (row, _) in self.rows.items()}
         return Linear(slopes, hot, np.vstack(A), np.concatenate(b), np.concatenate(far))
 
@@ -280,7 +280,7 @@ class Search:
                 break
             self._learn(state, unknown[:MOST])
             linear = replace(linear, hot={key: row for key, (row, _) in self.rows.items()})
-        return max(tries, key=lambda one: one.fall, default=None)
+        return max(tries, key=lambda item: item.fall, default=None)
 
     def _trial(self, state: State, linear: Linear) -> Step | None:
         """Return the step that the linear limits allow, and what it leads to; None: no parts."""
@@ -306,28 +306,28 @@ class Search:
         places = dict(zip(keys, dual[m:], strict=True))
         return Step(promised, dual[:m], places, after, whole, anew, fall)
 
-    def _merit(self, one: State, held: State) -> float:
-        v, price = one.against(held.held), self.price * abs(held.values[0])
-        worst = max(one.places.values(), default=-1.0)
+    def _merit(self, state: State, held: State) -> float:
+        v, price = state.against(held.held), self.price * abs(held.values[0])
+        worst = max(state.places.values(), default=-1.0)
         return float(v[0] + price * np.maximum(np.append(v[1:], worst), 0.0).sum())
 
     def _led_to(self, state: State, x: np.ndarray) -> tuple[State, np.ndarray, bool] | None:
         """Return the state after a step, the whole step, and whether its meshes are new."""
         first, after, whole = 0, dict[int, FreeSides](), []
         try:
-            for k, one in state.outlines.items():
-                part = x[first : first + one.count]
-                first += one.count
-                near = one.moved(part).nearest()
+            for k, outline in state.outlines.items():
+                part = x[first : first + outline.count]
+                first += outline.count
+                near = outline.moved(part).nearest()
                 if near is None:
                     return None
                 after[k] = near[0]
                 whole.append(part + near[1])
             every = self.problem.every(after)
-            bodies = {k: one.followed(state.bodies[k]) for k, one in every.items()}
+            bodies = {k: item.followed(state.bodies[k]) for k, item in every.items()}
             followed = {k: body for k, body in bodies.items() if body is not None}
             anew = len(followed) < len(bodies)
-            found = self.problem.evaluated(after, {} if anew else followed, state.solutions)
+            result = self.problem.evaluated(after, {} if anew else followed, state.solutions)
         except (BrokenError, ConvergenceError, InputError):
             return None
-        return found, np.concatenate(whole), anew
+        return result, np.concatenate(whole), anew

@@ -97,14 +97,14 @@ class _Loop:
         file = self.file
         corners = [file.vertex(curve.start, z) for curve, _ in self.curves]
         self.vertices[z] = corners
-        found = []
+        result = []
         for k, (curve, name) in enumerate(self.curves):
             ends = f"{corners[k]},{corners[(k + 1) % len(corners)]}"
             sense = ".F." if isinstance(curve, Arc) and curve.sweep < 0.0 else ".T."
-            found.append(
+            result.append(
                 file.add(f"EDGE_CURVE({_string(name)},{ends},{file.curve(curve, z)},{sense})")
             )
-        return found
+        return result
 
     def walls(self, low: Sequence[str], high: Sequence[str]) -> list[str]:
         """Add the faces between edges at two heights and return them; outwards is to the right."""
@@ -114,14 +114,14 @@ class _Loop:
         for (curve, _), a, b in zip(self.curves, below, above, strict=True):
             line = f"LINE('',{file.point(curve.start, z)},{file.vector(UP)})"
             posts.append(file.add(f"EDGE_CURVE('',{a},{b},{file.add(line)},.T.)"))
-        found = []
+        result = []
         for k, (curve, name) in enumerate(self.curves):
             after = posts[(k + 1) % len(posts)]
             sides = [(low[k], ".T."), (after, ".T."), (high[k], ".F."), (posts[k], ".F.")]
             bound = _bound(file, sides)
             surface, sense = file.wall(curve, z)
-            found.append(file.add(f"ADVANCED_FACE({_string(name)},({bound}),{surface},{sense})"))
-        return found
+            result.append(file.add(f"ADVANCED_FACE({_string(name)},({bound}),{surface},{sense})"))
+        return result
 
 
 def _bound(file: _File, sides: Iterable[tuple[str, str]]) -> str:
@@ -261,8 +261,8 @@ def _reals(values: Iterable[float]) -> str:
 def _string(text: str) -> str:
     """Return a string in quotes; letters beyond ASCII by their numbers."""
     coded = "".join(
-        one if " " <= one <= "~" else f"\\X2\\{one.encode('utf-16-be').hex().upper()}\\X0\\"
-        for one in text.replace("\\", "\\\\").replace("'", "''")
+        item if " " <= item <= "~" else f"\\X2\\{item.encode('utf-16-be').hex().upper()}\\X0\\"
+        for item in text.replace("\\", "\\\\").replace("'", "''")
     )
     return f"'{coded}'"
 
@@ -300,7 +300,7 @@ def r12_text(shape: Shape, tolerance: float) -> str:
             if _is_circle(loop):
                 _draw(model, loop[0].curve, look)
                 continue
-            corners = [one for piece in loop for one in _corners(piece.curve, tolerance)]
+            corners = [corner for piece in loop for corner in _corners(piece.curve, tolerance)]
             model.add_polyline2d(corners, format="xyb", close=True, dxfattribs=look)
         return _text(document)
 

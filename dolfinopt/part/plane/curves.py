@@ -334,24 +334,24 @@ class Shape:
     @cached_property
     def concave(self) -> list[Concave]:
         """Its concave corners, arcs and splines."""
-        found = []
+        result = []
         for loop in self.loops:
             for before, after in zip((loop[-1], *loop[:-1]), loop):
                 a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
                 if _cross(a, b) < -np.sin(KINK):
-                    found.append(Concave(after.curve.start, 0.0, before.free or after.free))
+                    result.append(Concave(after.curve.start, 0.0, before.free or after.free))
         for piece in self.pieces:
             t = np.linspace(0.0, 1.0, 33)
             bend = curvature(piece.curve, t)
             if (least := bend.min()) < 0.0:
                 place = piece.curve.at(t)[bend.argmin()]
-                found.append(Concave(place, -1.0 / float(least), piece.free))
-        return found
+                result.append(Concave(place, -1.0 / float(least), piece.free))
+        return result
 
     @property
     def concave_radius(self) -> float:
         """Smallest radius of concave places beside free curves, m; infinity without any."""
-        return min((one.radius for one in self.concave if one.free), default=np.inf)
+        return min((item.radius for item in self.concave if item.free), default=np.inf)
 
     def is_simple(self, tolerance: float) -> bool:
         """Return whether no curve crosses another one, as polygons within a distance see it."""

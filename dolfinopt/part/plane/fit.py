@@ -101,17 +101,17 @@ def fitted_sides(
     least = np.pi * limits.tool**2 if hole is None else hole
     thin = replace(limits, member=min(limits.member, THIN * limits.cell))
     for kept, shares in ((limits, ATTEMPTS), (limits, COARSER), (thin, ATTEMPTS)):
-        found: list[tuple[bool, float, Sides]] = []
+        result: list[tuple[bool, float, Sides]] = []
         for share in shares:
             made = _made(outline, kept, share * tolerance, area, least)
             if made is None:
                 continue
             off, far = abs(made.shape.area / area - 1.0) > AREA, distance(made, outline)
-            found.append((off, far, made))
+            result.append((off, far, made))
             if not off and far <= tolerance:
                 break
-        if found:  # what is thinner than asked for, or further off, is told
-            return min(found, key=lambda one: one[:2])[2]
+        if result:  # what is thinner than asked for, or further off, is told
+            return min(result, key=lambda item: item[:2])[2]
     raise InputError(
         f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
         "the outline; choose another --tolerance or a smaller --tool-radius"
@@ -126,8 +126,8 @@ def _made(
         drawn = _drawn(outline, limits, tolerance, hole)
     except BrokenError:
         return None
-    found = limits.nearest(drawn, area=area) or limits.nearest(drawn)
-    return None if found is None else found[0]
+    result = limits.nearest(drawn, area=area) or limits.nearest(drawn)
+    return None if result is None else result[0]
 
 
 def distance(sides: Sides, outline: Outline) -> float:
@@ -135,9 +135,9 @@ def distance(sides: Sides, outline: Outline) -> float:
     import shapely
 
     lines = [
-        shapely.LineString(one.piece.curve.at(np.linspace(0.0, 1.0, 17)))
-        for one in sides.placed
-        if one.piece.free
+        shapely.LineString(item.piece.curve.at(np.linspace(0.0, 1.0, 17)))
+        for item in sides.placed
+        if item.piece.free
     ]
     if not lines:
         return 0.0
@@ -251,8 +251,8 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
                 circles += _named_circles(circle, twins, halved, names)
                 continue
             closed = len(chain) == 1 and not halved
-            drawn = [one for run in chain for one in _sides_along(run, edges, tolerance, closed)]
-            drawn = _distinct([one.named(key=next(names)) for one in drawn], halved)
+            drawn = [item for run in chain for item in _sides_along(run, edges, tolerance, closed)]
+            drawn = _distinct([item.named(key=next(names)) for item in drawn], halved)
             drawn = _whole(drawn, names) if halved else drawn
             drawn = cornered(cleaned(drawn, limits), limits, gap, tolerance)
             if not drawn:
@@ -261,12 +261,12 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> S
                 curve = drawn[0].side.curve
                 assert curve is not None
                 piece = Piece(curve, drawn[0].side.label)
-                fixed += [(one,) for one in ([piece, _mirrored(piece)] if twins else [piece])]
+                fixed += [(item,) for item in ([piece, _mirrored(piece)] if twins else [piece])]
                 continue
             pair = [drawn]
             if twins:
-                pair[0] = [one.named(twin=next(names)) for one in drawn]
-                pair.append([one.mirrored() for one in reversed(pair[0])])
+                pair[0] = [item.named(twin=next(names)) for item in drawn]
+                pair.append([item.mirrored() for item in reversed(pair[0])])
             loops += [looped(some, limits, outer, as_wide) for some in pair]
     loops.sort(key=lambda loop: -loop.area)
     return Sides(tuple(loops), tuple(circles), tuple(fixed)).centred()
@@ -360,32 +360,32 @@ def _straight(points: np.ndarray, tolerance: float, closed: bool) -> list[Drawn]
     passed = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
     last = len(points) - 1
     at = [passed[np.argmin(np.linalg.norm(points[:last] - c, axis=1))] for c in corners[:-1]]
-    found = []
+    result = []
     for (a, b), ends in zip(pairwise([*at, passed[-1]]), pairwise(corners), strict=True):
         cut = 0.5 * (1.0 - MIDDLE) * (b - a)
         p = shapely.get_coordinates(line.interpolate(np.linspace(a + cut, b - cut, 40)))
         middle = p.mean(axis=0)
         d = np.linalg.svd(p - middle)[2][0]
         d = d if d @ (p[-1] - p[0]) > 0.0 else -d
-        found.append(Drawn(Side(middle, angle_of(d)), *ends))
-    return found
+        result.append(Drawn(Side(middle, angle_of(d)), *ends))
+    return result
 
 
 def _distinct(drawn: Sequence[Drawn], halved: bool = False) -> list[Drawn]:
     """Return sides without those of the arm's own that go on as the one before."""
-    found: list[Drawn] = []
+    result: list[Drawn] = []
     names: dict[int, int] = {}
-    for one in drawn:
-        if found and _goes_on(found[-1].side, one.side):
-            names[one.side.key] = found[-1].side.key
-            found[-1] = replace(found[-1], end=one.end)
+    for item in drawn:
+        if result and _goes_on(result[-1].side, item.side):
+            names[item.side.key] = result[-1].side.key
+            result[-1] = replace(result[-1], end=item.end)
         else:
-            found.append(one)
-    if len(found) > 1 and not halved and _goes_on(found[-1].side, found[0].side):
-        names[found[-1].side.key] = found[0].side.key
-        found[0] = replace(found[0], start=found[-1].start)
-        del found[-1]
-    return [one.named(twin=names.get(one.side.twin, one.side.twin)) for one in found]
+            result.append(item)
+    if len(result) > 1 and not halved and _goes_on(result[-1].side, result[0].side):
+        names[result[-1].side.key] = result[0].side.key
+        result[0] = replace(result[0], start=result[-1].start)
+        del result[-1]
+    return [entry.named(twin=names.get(entry.side.twin, entry.side.twin)) for entry in result]
 
 
 def _goes_on(a: Side, b: Side) -> bool:
@@ -404,9 +404,9 @@ def _goes_on(a: Side, b: Side) -> bool:
 def _whole(half: Sequence[Drawn], names: Iterator[int]) -> list[Drawn]:
     """Return the sides of a whole loop from those of its upper half."""
     # The first and the last may cross the axis: circles about it, and lines, which become upright.
-    made = [_crossing(one) if k in (0, len(half) - 1) else one for k, one in enumerate(half)]
-    made = [one if one.side.twin >= 0 else one.named(twin=next(names)) for one in made]
-    whole = made + [one.mirrored() for one in reversed(made) if one.side.key != one.side.twin]
+    made = [_crossing(item) if k in (0, len(half) - 1) else item for k, item in enumerate(half)]
+    made = [item if item.side.twin >= 0 else item.named(twin=next(names)) for item in made]
+    whole = made + [item.mirrored() for item in reversed(made) if item.side.key != item.side.twin]
     # A side across the axis begins, or ends, at the mirror image of its other end.
     if len(half) > 1 and made[0].side.key == made[0].side.twin:
         whole[0] = replace(made[0], start=made[0].end * MIRROR)
@@ -415,19 +415,19 @@ def _whole(half: Sequence[Drawn], names: Iterator[int]) -> list[Drawn]:
     return whole
 
 
-def _crossing(one: Drawn) -> Drawn:
+def _crossing(drawn: Drawn) -> Drawn:
     """Return a side that ends on the axis of symmetry as its own mirror image, if it may be one."""
-    side = one.side
+    side = drawn.side
     if isinstance(side.curve, Arc):
         is_own = abs(side.curve.centre[1]) < 1e-9
     else:
         slack = np.sin(UPRIGHT if side.free else 1e-4)
         is_own = (side.free or isinstance(side.curve, Line)) and abs(np.cos(side.angle)) < slack
     if not is_own:
-        return one
+        return drawn
     angle = 0.5 * np.pi * float(np.sign(np.sin(side.angle)))
     return replace(
-        one, side=replace(side, point=side.point * [1.0, 0.0], angle=angle, twin=side.key)
+        drawn, side=replace(side, point=side.point * [1.0, 0.0], angle=angle, twin=side.key)
     )
 
 
@@ -440,15 +440,15 @@ def _vertices(drawn: Sequence[Drawn], reach: float) -> tuple[np.ndarray, list[fl
     The turn is NaN where they do not meet within a length, m, of their ends.
     """
     places, turns = [], []
-    for k, one in enumerate(drawn):
+    for k, item in enumerate(drawn):
         before = drawn[k - 1]
-        near, turn = 0.5 * (before.end + one.start), float("nan")
-        apart = float(np.linalg.norm(before.end - one.start))
+        near, turn = 0.5 * (before.end + item.start), float("nan")
+        apart = float(np.linalg.norm(before.end - item.start))
         try:
-            place = meet(before.side, one.side, 0.0, near)
+            place = meet(before.side, item.side, 0.0, near)
             if np.linalg.norm(place - near) < reach + apart:
                 near = place
-                turn = turn_between(before.side.foot(place)[1], one.side.foot(place)[1])
+                turn = turn_between(before.side.foot(place)[1], item.side.foot(place)[1])
         except BrokenError:
             pass
         places.append(near)
@@ -462,13 +462,13 @@ def cleaned(drawn: Sequence[Drawn], limits: Limits) -> list[Drawn]:
     Empty where nothing is left of a loop.
     """
     drawn = _distinct(drawn)
-    while len(drawn) > 2 or not any(one.side.free for one in drawn):
+    while len(drawn) > 2 or not any(item.side.free for item in drawn):
         k, merges = _worst(drawn, limits)
         if k is None:
             return drawn
         drawn = _merged(drawn, k) if merges else drawn
         gone = drawn[k].names
-        drawn = _distinct([one for one in drawn if not one.names & gone])
+        drawn = _distinct([item for item in drawn if not item.names & gone])
     return []
 
 
@@ -481,11 +481,11 @@ def cornered(drawn: list[Drawn], limits: Limits, gap: Gap, tolerance: float) -> 
         gap: distance of a place from the outline, m.
         tolerance: distance from it up to which a sharp corner will do, m.
     """
-    for one in sorted(drawn, key=lambda one: float(np.linalg.norm(one.end - one.start))):
+    for item in sorted(drawn, key=lambda entry: float(np.linalg.norm(entry.end - entry.start))):
         names = [other.names for other in drawn]
-        if one.names in names and one.side.free and len(drawn) > 2 + len(one.names):
-            if _corner_will_do(drawn, names.index(one.names), limits, gap, tolerance):
-                left = cleaned([other for other in drawn if not other.names & one.names], limits)
+        if item.names in names and item.side.free and len(drawn) > 2 + len(item.names):
+            if _corner_will_do(drawn, names.index(item.names), limits, gap, tolerance):
+                left = cleaned([other for other in drawn if not other.names & item.names], limits)
                 drawn = left or drawn
     return drawn
 
@@ -524,22 +524,22 @@ def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
     places, turns = _vertices(drawn, REACH * limits.cell)
     need = [limits.tool * np.tan(min(-turn / 2.0, STEEP)) if turn < 0.0 else 0.0 for turn in turns]
     worst, least, merges = None, np.inf, False
-    for k, one in enumerate(drawn):
+    for k, item in enumerate(drawn):
         j = (k + 1) % len(drawn)
         before, after = drawn[k - 1].side, drawn[j].side
-        if one.side.label or not (one.side.free or before.free or after.free):
+        if item.side.label or not (item.side.free or before.free or after.free):
             continue
         step = places[j] - places[k]
-        room = float(step @ unit(one.side.angle) if one.side.free else np.linalg.norm(step))
+        room = float(step @ unit(item.side.angle) if item.side.free else np.linalg.norm(step))
         room -= need[k] + need[j] + LEAST * limits.cell
         meets = not np.isnan([turns[k], turns[j]]).any()
         is_end = any(turns[i] > SPIKE for i in (k, j))  # of a strut that ends nowhere
-        both = before.free and one.side.free and one.side.twin != before.key
+        both = before.free and item.side.free and item.side.twin != before.key
         straight = both and abs(turns[k]) < 2.0 * TURN
         if room >= 0.0 and meets and not is_end and not straight:
             continue
         # The shortest one: where two sides do not meet well, a long one looks turned round.
-        size = 0.0 if straight else float(np.linalg.norm(one.end - one.start))
+        size = 0.0 if straight else float(np.linalg.norm(item.end - item.start))
         if size < least:
             worst, least, merges = k, size, straight
     return worst, merges
@@ -598,4 +598,4 @@ def looped(
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
         near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)
         corners.append(Corner(near, radius))
-    return Loop(tuple(one.side for one in drawn), tuple(corners))
+    return Loop(tuple(item.side for item in drawn), tuple(corners))

@@ -91,9 +91,9 @@ class FreeSides:
         made, number = self, 0
         while True:
             for sides in fewer(made.sides, self.limits, self.part.domain.outer_edges):
-                found = replace(made, sides=sides).nearest()
-                if found is not None and found[0].count < made.count:
-                    made, number = found[0], number + 1
+                result = replace(made, sides=sides).nearest()
+                if result is not None and result[0].count < made.count:
+                    made, number = result[0], number + 1
                     break
             else:
                 return made, number
@@ -108,8 +108,8 @@ class FreeSides:
 
     def nearest(self) -> tuple[FreeSides, np.ndarray] | None:
         """Return the nearest one that keeps the limits, and the step to it; None: there is none."""
-        found = self.limits.nearest(self.sides)
-        return None if found is None else (replace(self, sides=found[0]), found[1])
+        result = self.limits.nearest(self.sides)
+        return None if result is None else (replace(self, sides=result[0]), result[1])
 
     def meshed(self, finer: Sequence[np.ndarray]) -> Mesh:
         """Return a new mesh of it, see `part.Part.mesh`."""
@@ -125,9 +125,9 @@ class FreeSides:
         assert isinstance(mesh, BodyMesh)
         if len(mesh.shape.pieces) != len(self.sides.shape.pieces):
             return None
-        found = mesh.morphed(self.sides.shape)
+        result = mesh.morphed(self.sides.shape)
         least = min(WORN, WORSE * mesh.quality.min())
-        return None if found.quality.min() < least else found
+        return None if result.quality.min() < least else result
 
     def by_x(self, mesh: Mesh, by_nodes: np.ndarray) -> np.ndarray:
         """Return derivatives (m, count) by x from those (m, n, d) by the nodes of its mesh."""
@@ -136,11 +136,11 @@ class FreeSides:
             return self.by_x(mesh.face, flat)
         assert isinstance(mesh, BodyMesh)
         g = mesh.at_outline(by_nodes)
-        found = np.zeros((len(g), self.sides.numbers[0]))
-        for number, one in enumerate(self.sides.placed):
+        result = np.zeros((len(g), self.sides.numbers[0]))
+        for number, item in enumerate(self.sides.placed):
             here = np.flatnonzero(mesh.piece == number)
-            found += one.pull(mesh.span[here, 0], g[:, here], len(here))
-        return found @ self._ties
+            result += item.pull(mesh.span[here, 0], g[:, here], len(here))
+        return result @ self._ties
 
     def area_by_x(self) -> np.ndarray:
         """Return the derivative (count,) of the area by x."""
@@ -195,7 +195,10 @@ class FreeSides:
                 numbers = side.edge, turned, side.key, side.twin
                 rows.append([*side.point, side.angle, *map(float, numbers)])
                 corners.append([*corner.place, corner.radius])
-        circles = [[*one.centre, one.radius, one.key, one.twin] for one in self.sides.circles]
+        circles = [
+            [*circle.centre, circle.radius, circle.key, circle.twin]
+            for circle in self.sides.circles
+        ]
         return {
             "sides": np.array(rows), "corners": np.array(corners), "sizes": np.array(sizes),
             "circles": np.array(circles).reshape(-1, 5),

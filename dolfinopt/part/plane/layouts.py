@@ -67,8 +67,8 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     def polygon(flange: float, rounds: bool = True) -> Polygon:
         widths = flange, max(STRUT * flange, domain.minimum_member)
         holes = polygons_of(_windows(arm, stays, span, widths, slope, fewest, domain.symmetric))
-        kept = [rounded(one) if rounds else one for one in holes if rounded(one).area > least]
-        return max(polygons_of(arm.difference(shapely.union_all(kept))), key=lambda one: one.area)
+        kept = [rounded(item) if rounds else item for item in holes if rounded(item).area > least]
+        return max(polygons_of(arm.difference(shapely.union_all(kept))), key=lambda item: item.area)
 
     def missing(flange: float) -> float:
         return polygon(flange).area / drawn.area - 1.0
@@ -82,13 +82,13 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
         flange = brentq(missing, thin, thick, xtol=AREA * domain.cell)
     # Sides find their sharp corners, and are rounded there.
     sharp = polygon(flange, rounds=False)
-    found = replace(drawn, polygon=sharp, islands=0, islands_area=0.0, filled=0)
+    result = replace(drawn, polygon=sharp, islands=0, islands_area=0.0, filled=0)
     area = domain.volume * (1.0 + max(excess, 0.0))
     try:
-        sides = fitted_sides(found, limits, CLOSE * domain.cell, area)
+        sides = fitted_sides(result, limits, CLOSE * domain.cell, area)
     except InputError as error:
         raise ConvergenceError(str(error)) from None
-    return replace(part, outline=found, sides=sides)
+    return replace(part, outline=result, sides=sides)
 
 
 def _between_bores(
@@ -99,7 +99,7 @@ def _between_bores(
     import shapely
 
     left, _, right, _ = arm.bounds
-    middle, rings = 0.5 * (left + right), [one.bounds for one in polygons_of(stays)]
+    middle, rings = 0.5 * (left + right), [item.bounds for item in polygons_of(stays)]
     ahead = [box for box in rings if box[2] < middle]
     behind = [box for box in rings if box[0] > middle]
     first = max((b for _, _, b, _ in ahead), default=left)
@@ -134,7 +134,7 @@ def _windows(
     parts = polygons_of(inside)
     if not parts:
         return shapely.Polygon()
-    left, low, right, high = max(parts, key=lambda one: one.area).bounds
+    left, low, right, high = max(parts, key=lambda part: part.area).bounds
     left, right = max(left, span[0]), min(right, span[1])
     bays = max(fewest, round((right - left) / (slope * (high - low))))
     x = np.linspace(left, right, bays + 1)

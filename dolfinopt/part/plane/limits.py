@@ -77,11 +77,11 @@ class Limits:
         Raises:
             BrokenError: sides do not close to a loop.
         """
-        found = [*self._of_pieces(sides), *self._of_sharp_corners(sides)]
-        found += [*self._widths(sides), *self._places(sides)]
-        if not found:
+        result = [*self._of_pieces(sides), *self._of_sharp_corners(sides)]
+        result += [*self._widths(sides), *self._places(sides)]
+        if not result:
             return np.empty(0), np.empty((0, sides.count))
-        values, slopes = zip(*found, strict=True)
+        values, slopes = zip(*result, strict=True)
         A = np.array(slopes) @ sides.ties
         moves = np.abs(A).max(axis=1, initial=0.0) > 1e-9  # others are the arm's own
         return np.array(values)[moves], A[moves]
@@ -94,16 +94,16 @@ class Limits:
 
     def _of_pieces(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         """Yield the rows of lengths, turns of fillets and radii."""
-        for one in sides.placed:
-            curve, moves = one.piece.curve, one.moves
+        for item in sides.placed:
+            curve, moves = item.piece.curve, item.moves
             if isinstance(moves, ArcMoves):
                 assert isinstance(curve, Arc)
-                if one.fillet:
+                if item.fillet:
                     yield from self._turn(-curve.sweep, moves.start - moves.end)
                 yield self.tool - curve.radius, -moves.radius
                 yield curve.radius - LARGEST * self.cell, moves.radius
             elif isinstance(moves, LineMoves):
-                side = sides.loops[one.loop].sides[one.side]
+                side = sides.loops[item.loop].sides[item.side]
                 d = unit(side.angle) if side.curve is None else direction(side.curve, 0.0)
                 length = float((curve.end - curve.start) @ d)
                 yield SHORT * self.cell - length, -d @ (moves.end - moves.start)
@@ -114,7 +114,7 @@ class Limits:
                 yield SHORT * self.cell - float(WEIGHTS @ speed), -slope
 
     def _of_sharp_corners(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
-        placed = {(one.loop, one.side): one for one in sides.placed if not one.fillet}
+        placed = {(item.loop, item.side): item for item in sides.placed if not item.fillet}
         for i, loop in enumerate(sides.loops):
             for k, corner in enumerate(loop.corners):
                 a, b = loop.sides[k - 1], loop.sides[k]
@@ -128,24 +128,24 @@ class Limits:
     # -- widths of members and gaps ---------------------------------------------------------------
 
     def _widths(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
-        found = facing(sides, self.cell, NEAR * max(self.member, self.gap))
+        result = facing(sides, self.cell, NEAR * max(self.member, self.gap))
         for members, least in ((True, self.member), (False, self.gap)):
-            near = np.flatnonzero((found.members == members) & (found.width < NEAR * least))
-            key = np.sort(found.pairs[near], axis=1)
+            near = np.flatnonzero((result.members == members) & (result.width < NEAR * least))
+            key = np.sort(result.pairs[near], axis=1)
             _, group = np.unique(key, axis=0, return_inverse=True)
-            for one in range(group.max(initial=-1) + 1):
-                here = near[group.ravel() == one]
-                low = here[np.argmin(found.width[here])]
-                same = here[found.pairs[here, 0] == found.pairs[low, 0]]
-                far = same[np.argmax(np.abs(found.t[same, 0] - found.t[low, 0]))]
+            for item in range(group.max(initial=-1) + 1):
+                here = near[group.ravel() == item]
+                low = here[np.argmin(result.width[here])]
+                same = here[result.pairs[here, 0] == result.pairs[low, 0]]
+                far = same[np.argmax(np.abs(result.t[same, 0] - result.t[low, 0]))]
                 for k in {low, far}:
-                    yield least - found.width[k], found.by_q(k, sides.numbers[0])
+                    yield least - result.width[k], result.by_q(k, sides.numbers[0])
 
     # -- where material may be and must be --------------------------------------------------------
 
     def _places(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         # Fillets lie between their sides.
-        moving = [one for one in sides.placed if one.piece.free and not one.fillet]
+        moving = [item for item in sides.placed if item.piece.free and not item.fillet]
         if not moving:
             return
         number, t, at, _ = _samples(moving, self.cell)
@@ -153,13 +153,13 @@ class Limits:
             if region.is_empty:
                 continue
             distance, slope = _signed(region, at)
-            for k, one in enumerate(moving):
+            for k, item in enumerate(moving):
                 here = np.flatnonzero(number == k)
                 worst = here[np.argmax(sign * distance[here])]
                 value = sign * distance[worst]
                 if value > -self.cell:
                     g = sign * slope[worst]
-                    yield value - 0.5 * KEPT, one.pull(t[worst : worst + 1], g[None, None])[0]
+                    yield value - 0.5 * KEPT, item.pull(t[worst : worst + 1], g[None, None])[0]
 
     # -- the nearest outline that keeps them -------------------------------------------------------
 
@@ -184,10 +184,10 @@ class Limits:
                 if g.max(initial=-1.0) < KEPT:
                     return (sides, whole) if self.is_simple(sides) else None
                 some = g > -FARTHEST * self.cell
-                found = least_move(A[some], -g[some] - margin[some], self.cell)
-                if found is None or (size := np.abs(found[0]).max()) > 6.0 * FARTHEST * self.cell:
+                result = least_move(A[some], -g[some] - margin[some], self.cell)
+                if result is None or (size := np.abs(result[0]).max()) > 6.0 * FARTHEST * self.cell:
                     return None
-                x = found[0] * min(1.0, FARTHEST * self.cell / size)
+                x = result[0] * min(1.0, FARTHEST * self.cell / size)
                 sides, whole = sides.moved(sides.ties @ x), whole + x
             except BrokenError:
                 return None
@@ -235,24 +235,24 @@ def rounded_radii(sides: Sides, limits: Limits) -> Sides:
         )
         for loop in sides.loops
     )
-    circles = tuple(replace(one, radius=whole(one.radius)) for one in sides.circles)
+    circles = tuple(replace(circle, radius=whole(circle.radius)) for circle in sides.circles)
     made = replace(sides, loops=loops, circles=circles, holds_radii=True)
-    found = limits.nearest(made, area=sides.shape.area) or limits.nearest(made)
-    return sides if found is None else replace(found[0], holds_radii=False)
+    result = limits.nearest(made, area=sides.shape.area) or limits.nearest(made)
+    return sides if result is None else replace(result[0], holds_radii=False)
 
 
-def _angle(sides: Sides, one: Placed, end: int) -> np.ndarray:
+def _angle(sides: Sides, placed: Placed, end: int) -> np.ndarray:
     """Return the derivative (n,) by q of the direction's angle at an end of a side."""
     count, of_sides, _ = sides.numbers
-    found = np.zeros(count)
-    if (at := of_sides.get((one.loop, one.side))) is not None:
-        found[at + 1] = 1.0
-    elif isinstance(one.moves, OwnMoves):
+    result = np.zeros(count)
+    if (at := of_sides.get((placed.loop, placed.side))) is not None:
+        result[at + 1] = 1.0
+    elif isinstance(placed.moves, OwnMoves):
         t = np.array([float(end)])
-        speed = np.linalg.norm(one.piece.curve.derivative(t))
-        by_t = (one.moves.start, one.moves.end)[end]
-        found = curvature(one.piece.curve, t)[0] * speed * by_t
-    return found
+        speed = np.linalg.norm(placed.piece.curve.derivative(t))
+        by_t = (placed.moves.start, placed.moves.end)[end]
+        result = curvature(placed.piece.curve, t)[0] * speed * by_t
+    return result
 
 
 # -- places of the outline that face each other --------------------------------------------------
@@ -283,11 +283,11 @@ class Facing:
 
     def by_q(self, k: int, count: int) -> np.ndarray:
         """Return the derivative (count,) by q of the width of pair k, less its sign."""
-        found, u = np.zeros(count), self.across[k] / self.width[k]
+        result, u = np.zeros(count), self.across[k] / self.width[k]
         for which, t, g in zip(self.pairs[k], self.t[k], (u, -u), strict=True):
             if self.every[which].moves is not None:
-                found = found + self.every[which].pull(np.array([t]), g[None, None])[0]
-        return found
+                result = result + self.every[which].pull(np.array([t]), g[None, None])[0]
+        return result
 
 
 def facing(sides: Sides, cell: float, most: float) -> Facing:
@@ -298,15 +298,15 @@ def facing(sides: Sides, cell: float, most: float) -> Facing:
         cell: distance of the places from which they are looked for, m.
         most: m.
     """
-    every = [*sides.placed, *(Placed(one, None) for ring in sides.fixed for one in ring)]
-    every = [part for one in every for part in _chords(one, CHORD * cell)]
+    every = [*sides.placed, *(Placed(item, None) for ring in sides.fixed for item in ring)]
+    every = [part for item in every for part in _chords(item, CHORD * cell)]
     number, _, at, _ = _samples(every, cell)
     pairs = cKDTree(at).query_pairs(most + cell, output_type="ndarray")
     pairs = np.vstack([pairs, pairs[:, ::-1]])
     place, other = np.unique(np.stack([pairs[:, 0], number[pairs[:, 1]]]), axis=1)
     apart = ~_together(every, sides)[number[place], other]
     place, other = place[apart], other[apart]
-    own, curves = number[place], [one.piece.curve for one in every]
+    own, curves = number[place], [item.piece.curve for item in every]
     _, near, _ = _closest(curves, other, at[place])
     some = np.linalg.norm(near - at[place], axis=1) < most
     own, other, near = own[some], other[some], near[some]
@@ -326,18 +326,18 @@ def facing(sides: Sides, cell: float, most: float) -> Facing:
 
 def thinnest_member(sides: Sides, cell: float) -> float | None:
     """Return the width of the thinnest member, m; None where none is below `WIDE` cells."""
-    found = facing(sides, cell, WIDE * cell)
-    return float(found.width[found.members].min(initial=np.inf)) if found.members.any() else None
+    result = facing(sides, cell, WIDE * cell)
+    return float(result.width[result.members].min(initial=np.inf)) if result.members.any() else None
 
 
-def _chords(one: Placed, chord: float) -> list[Placed]:
+def _chords(placed: Placed, chord: float) -> list[Placed]:
     """Return a piece; in place of a spline of the arm's own the lines along it, which stay."""
-    curve = one.piece.curve
+    curve = placed.piece.curve
     if not isinstance(curve, Spline):
-        return [one]
+        return [placed]
     points = curve.at(curve.parameters(chord))
     return [
-        Placed(Piece(Line(a, b), one.piece.label), None, one.loop, one.side)
+        Placed(Piece(Line(a, b), placed.piece.label), None, placed.loop, placed.side)
         for a, b in pairwise(points)
     ]
 
@@ -345,8 +345,8 @@ def _chords(one: Placed, chord: float) -> list[Placed]:
 def _samples(every: list[Placed], spacing: float) -> tuple[np.ndarray, ...]:
     """Return places along pieces: number of the piece, parameter, point and outward normal."""
     rows = []
-    for number, one in enumerate(every):
-        curve = one.piece.curve
+    for number, item in enumerate(every):
+        curve = item.piece.curve
         is_line = isinstance(curve, Line)
         length = float(np.linalg.norm(curve.derivative(np.array([0.5]))))
         if not length > 0.0:
@@ -363,14 +363,14 @@ def _samples(every: list[Placed], spacing: float) -> tuple[np.ndarray, ...]:
 
 def _together(every: list[Placed], sides: Sides) -> np.ndarray:
     """Return which pairs (n, n) of pieces are the same, share a corner, or are next to it."""
-    loop = np.array([one.loop for one in every])
-    side = np.array([one.side for one in every])
+    loop = np.array([item.loop for item in every])
+    side = np.array([item.side for item in every])
     size = np.array([len(sides.loops[i].sides) if i >= 0 else 1 for i in loop])
     steps = (side[:, None] - side) % size[:, None]
     beside = (steps <= 1) | (steps == size[:, None] - 1)
-    found = (loop[:, None] == loop) & (loop >= 0) & beside
-    stays = np.array([one.moves is None for one in every])
-    return found | (stays[:, None] & stays) | np.eye(len(every), dtype=bool)
+    result = (loop[:, None] == loop) & (loop >= 0) & beside
+    stays = np.array([item.moves is None for item in every])
+    return result | (stays[:, None] & stays) | np.eye(len(every), dtype=bool)
 
 
 def _closest(

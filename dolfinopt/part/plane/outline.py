@@ -122,10 +122,10 @@ def _interpolated(domain: Domain, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     points = np.vstack([domain.centroid, images])
     values = np.append(domain.field, domain.field[cell])
     grid = np.stack(np.meshgrid(x, y), axis=-1)
-    found = CloughTocher2DInterpolator(points, values)(grid)
-    outside = np.isnan(found)
-    found[outside] = NearestNDInterpolator(points, values)(grid[outside])
-    return found
+    result = CloughTocher2DInterpolator(points, values)(grid)
+    outside = np.isnan(result)
+    result[outside] = NearestNDInterpolator(points, values)(grid[outside])
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,17 +209,17 @@ def draw_outline(domain: Domain, limits: Limits) -> Outline:
     def excess(level: float) -> float:
         above = shapely.simplify(raster.above(level), CHORD * domain.cell)
         whole = shapely.union_all([above.intersection(limits.arm), stays])
-        found = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), level)
-        tried.append(found)
-        return 0.0 if found.off < AREA else found.area - volume
+        result = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), level)
+        tried.append(result)
+        return 0.0 if result.off < AREA else result.area - volume
 
     low, high = float(raster.values.min()), float(raster.values.max())
     step = 0.02 * (high - low)
     with suppress(ValueError):  # whatever the level the area is too large, or too small
         brentq(excess, low - step, high + step, xtol=AREA * (high - low))
-    found = min(tried, key=lambda one: one.off)
-    if found.off <= LEAP:
-        return found
+    result = min(tried, key=lambda item: item.off)
+    if result.off <= LEAP:
+        return result
     raise InputError(
         f"{where}: the material of the design does not hang together: at no level has the "
         "piece that joins both interfaces the design's volume; let the optimisation go on "
@@ -248,7 +248,7 @@ def _stays(domain: Domain, limits: Limits) -> Geometry:
     """Return where material must be, strips along the interfaces among it."""
     import shapely
 
-    strips = [one.buffer(STRIP * domain.cell) for one in _interfaces(domain)]
+    strips = [interface.buffer(STRIP * domain.cell) for interface in _interfaces(domain)]
     return shapely.union_all([limits.stays, *strips]).intersection(limits.arm)
 
 
@@ -257,7 +257,7 @@ def _linked(whole: Geometry, links: Geometry, near: float) -> Geometry:
     import shapely
 
     missing = shapely.buffer(shapely.get_parts(links.difference(whole)), near)
-    joins = [len(polygons_of(one)) > 1 for one in shapely.intersection(missing, whole)]
+    joins = [len(polygons_of(item)) > 1 for item in shapely.intersection(missing, whole)]
     return shapely.union_all([whole, *missing[joins]])
 
 
@@ -274,7 +274,7 @@ def _narrow(whole: Geometry, width: float, near: float) -> tuple[np.ndarray, np.
     wide = whole.buffer(-0.5 * width).buffer(0.5 * width + near)
     pieces = shapely.get_parts(whole.difference(wide))
     pieces = shapely.buffer(pieces[shapely.area(pieces) > 0.01 * width**2], 3.0 * near)
-    joined = [len(polygons_of(one)) for one in shapely.intersection(pieces, wide)]
+    joined = [len(polygons_of(item)) for item in shapely.intersection(pieces, wide)]
     return pieces, np.array(joined, dtype=int)
 
 
@@ -289,7 +289,7 @@ def _at(domain: Domain, limits: Limits, whole: Geometry, level: float) -> Outlin
     necks = shapely.union_all(narrow[joined != 1])  # a corner joins one wider piece
     parts = polygons_of(filled.difference(necks))
     near, ends = 1e-6 * domain.extent, _interfaces(domain)
-    whole = [p for p in parts if all(p.distance(one) < near for one in ends)]
+    whole = [p for p in parts if all(p.distance(end) < near for end in ends)]
     main = max(whole, key=lambda p: p.area, default=shapely.Polygon())
     dropped = [p for p in parts if p is not main]
     holes = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in parts)
@@ -310,6 +310,6 @@ def without_stubs(outline: Outline, limits: Limits, width: float) -> Outline:
         narrow, joined = _narrow(polygon, width, outline.chord)
         stubs = narrow[(joined == 1) & (shapely.area(narrow) > SMALLEST_STUB * width**2)]
         left = polygons_of(polygon.difference(shapely.union_all(stubs)).union(stays))
-        before, polygon = polygon.area, max(left, key=lambda one: one.area)
+        before, polygon = polygon.area, max(left, key=lambda item: item.area)
         if polygon.area > before - SMALLEST_STUB * width**2:
             return replace(outline, polygon=polygon)

@@ -89,8 +89,8 @@ class PlanePart:
     def tight(self) -> list[Concave]:
         """Concave corners and curves that the tool does not reach."""
         least = ENOUGH * self.outline.tool_radius
-        found = [one for one in self.shape.concave if one.radius < least]
-        return sorted(found, key=attrgetter("radius"))
+        result = [item for item in self.shape.concave if item.radius < least]
+        return sorted(result, key=attrgetter("radius"))
 
     @property
     def volume(self) -> float:
@@ -115,35 +115,35 @@ class PlanePart:
     @property
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
-        one, outline = self.domain, self.outline
-        found = []
-        found += one.gray_words
-        if one.crisp:
-            found.append(
-                f"arm {one.name!r}: design.npz does not tell what its densities were projected "
+        domain, outline = self.domain, self.outline
+        result = []
+        result += domain.gray_words
+        if domain.crisp:
+            result.append(
+                f"arm {domain.name!r}: design.npz does not tell what its densities were projected "
                 "from, as that of an optimisation does; the outline is that of the cells, blurred"
             )
         if outline.islands:
-            share = 100.0 * outline.islands_area / one.volume
+            share = 100.0 * outline.islands_area / domain.volume
             number = _count(outline.islands, "piece")
-            found.append(
-                f"arm {one.name!r}: {number} without a joint to both interfaces "
+            result.append(
+                f"arm {domain.name!r}: {number} without a joint to both interfaces "
                 f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
             )
         if self.tight:
             listed = "; ".join(map(str, self.tight[:TOLD]))
             more = f"; {len(self.tight) - TOLD} more in part.json" if len(self.tight) > TOLD else ""
             tool = 1e3 * outline.tool_radius
-            found.append(
-                f"arm {one.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
+            result.append(
+                f"arm {domain.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
             )
-        least = one.minimum_member or THIN
+        least = domain.minimum_member or THIN
         if self.thinnest is not None and self.thinnest < 0.9 * least:
-            found.append(
-                f"arm {one.name!r}: its thinnest neck is {1e3 * self.thinnest:.3g} mm wide, below "
-                f"the smallest that is asked for, {1e3 * least:.3g} mm"
+            result.append(
+                f"arm {domain.name!r}: its thinnest neck is {1e3 * self.thinnest:.3g} mm wide, "
+                f"below the smallest that is asked for, {1e3 * least:.3g} mm"
             )
-        return found
+        return result
 
     def figures(self, density: float) -> dict[str, Any]:
         """Return the entry of part.json.
@@ -151,13 +151,13 @@ class PlanePart:
         Args:
             density: of the material, kg/m3.
         """
-        one, shape = self.domain, self.shape
+        domain, shape = self.domain, self.shape
         radius = shape.concave_radius
         return {
             "area": shape.area,
             "volume": self.volume,
             "mass": density * self.volume,
-            "design_volume": one.volume * one.thickness,
+            "design_volume": domain.volume * domain.thickness,
             "level": self.outline.level,
             "distance": self.distance,
             "tolerance": self.tolerance,
@@ -165,11 +165,11 @@ class PlanePart:
             "loops": len(shape.loops),
             "tool_radius": self.outline.tool_radius,
             "smallest_concave_radius": radius if math.isfinite(radius) else None,
-            "tight_places": [[*one.place, one.radius] for one in self.tight],
+            "tight_places": [[*item.place, item.radius] for item in self.tight],
             "thinnest_member": self.thinnest,
             "islands_left_out": self.outline.islands,
             "holes_filled": self.outline.filled,
-            "grayness": one.grayness,
+            "grayness": domain.grayness,
             "warnings": self.warnings,
         }
 

@@ -142,7 +142,7 @@ class Loop:
     @property
     def places(self) -> np.ndarray:
         """Where its corners are (n, 2), m."""
-        return np.array([one.place for one in self.corners])
+        return np.array([corner.place for corner in self.corners])
 
     @property
     def area(self) -> float:
@@ -318,9 +318,10 @@ class Sides:
     def shape(self) -> Shape:
         """The outline in curves."""
         loops = [
-            tuple(one.piece for one in self.placed if one.loop == i) for i in range(len(self.loops))
+            tuple(item.piece for item in self.placed if item.loop == i)
+            for i in range(len(self.loops))
         ]
-        rings = [(one.piece,) for one in self.placed if one.loop < 0]
+        rings = [(item.piece,) for item in self.placed if item.loop < 0]
         whole = [*loops, *rings, *self.fixed]
         return Shape(tuple(sorted(whole, key=_enclosed, reverse=True)))
 
@@ -336,10 +337,10 @@ class Sides:
     def _of_circles(self) -> Iterator[Placed]:
         count, first = self.numbers[0], self.of_circles
         every, still = np.eye(count), np.zeros(count)
-        for k, one in enumerate(self.circles):
+        for k, circle in enumerate(self.circles):
             at = first + 3 * k
             moves = ArcMoves(every[at : at + 2], every[at + 2], still, still)
-            ring = Arc(one.centre, one.radius, 0.0, -2.0 * np.pi)
+            ring = Arc(circle.centre, circle.radius, 0.0, -2.0 * np.pi)
             yield Placed(Piece(ring, free=True), moves)
 
     def _of_loops(self) -> Iterator[Placed]:
@@ -401,20 +402,22 @@ class Sides:
                 for k, side in enumerate(loop.sides)
             )
             rounded = tuple(
-                replace(one, radius=one.radius + q[corners[i, k]]) if one.radius > 0.0 else one
-                for k, one in enumerate(loop.corners)
+                replace(corner, radius=corner.radius + q[corners[i, k]])
+                if corner.radius > 0.0
+                else corner
+                for k, corner in enumerate(loop.corners)
             )
             loops.append(Loop(made, rounded))
         steps = q[self.of_circles :].reshape(-1, 3)
         circles = tuple(
-            replace(one, centre=one.centre + step[:2], radius=one.radius + step[2])
-            for one, step in zip(self.circles, steps, strict=True)
+            replace(circle, centre=circle.centre + step[:2], radius=circle.radius + step[2])
+            for circle, step in zip(self.circles, steps, strict=True)
         )
         return replace(self, loops=tuple(loops), circles=circles).centred()
 
     def centred(self) -> Sides:
         """Return the same outline with sides known by their middles, corners by their places."""
-        at = {(one.loop, one.side, one.fillet): one.piece.curve for one in self.placed}
+        at = {(item.loop, item.side, item.fillet): item.piece.curve for item in self.placed}
         loops = []
         for i, loop in enumerate(self.loops):
             sides, corners = [], []
@@ -445,10 +448,10 @@ class Sides:
             image = self._beside(i, k, twins=True)
             if image in ends:
                 pairs.append((j, ends[image], 1.0))
-        rings = {one.key: self.of_circles + 3 * k for k, one in enumerate(self.circles)}
-        for one in self.circles:
-            if one.twin in rings:
-                j, twin = rings[one.key], rings[one.twin]
+        rings = {circle.key: self.of_circles + 3 * k for k, circle in enumerate(self.circles)}
+        for circle in self.circles:
+            if circle.twin in rings:
+                j, twin = rings[circle.key], rings[circle.twin]
                 pairs += [(j, twin, 1.0), (j + 1, twin + 1, -1.0), (j + 2, twin + 2, 1.0)]
         held: list[int] = []
         if self.holds_radii:
@@ -467,9 +470,11 @@ class Sides:
     @cached_property
     def _lengths(self) -> dict[tuple[int, int], float]:
         return {
-            (one.loop, one.side): float(np.linalg.norm(one.piece.curve.end - one.piece.curve.start))
-            for one in self.placed
-            if one.loop >= 0 and not one.fillet
+            (item.loop, item.side): float(
+                np.linalg.norm(item.piece.curve.end - item.piece.curve.start)
+            )
+            for item in self.placed
+            if item.loop >= 0 and not item.fillet
         }
 
     @property
@@ -479,12 +484,12 @@ class Sides:
 
     def area_by_q(self) -> np.ndarray:
         """Return the derivative (n,) of the area by q: the integral of dp . outward ds, m."""
-        found = np.zeros(self.numbers[0])
-        for one in self.placed:
-            d = one.piece.curve.derivative(GAUSS)
+        result = np.zeros(self.numbers[0])
+        for item in self.placed:
+            d = item.piece.curve.derivative(GAUSS)
             out = np.stack([d[:, 1], -d[:, 0]], axis=1) * WEIGHTS[:, None]
-            found += one.pull(GAUSS, out[None])[0]
-        return found
+            result += item.pull(GAUSS, out[None])[0]
+        return result
 
 
 def _enclosed(loop: tuple[Piece, ...]) -> float:

@@ -36,8 +36,8 @@ def without_teeth(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]:
             lengths = _length(sides, first.key), _length(sides, second.key)
             tip = turn_between(unit(first.angle), unit(second.angle))
             along = (
-                direction(one.curve, 0.5) if one.curve else unit(one.angle)
-                for one in (before, after)
+                direction(item.curve, 0.5) if item.curve else unit(item.angle)
+                for item in (before, after)
             )
             if (
                 tip > TIP
@@ -68,20 +68,20 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
     for loop in sides.loops[1:]:
         keys = {side.key for side in loop.sides} | {side.twin for side in loop.sides}
         if all(side.free for side in loop.sides) and abs(loop.area) < least:
-            kept = [one for one in sides.loops if not {s.key for s in one.sides} & keys]
+            kept = [item for item in sides.loops if not {s.key for s in item.sides} & keys]
             yield replace(sides, loops=tuple(kept))
     for ring in sides.circles:
         if np.pi * ring.radius**2 < least:
-            left = [one for one in sides.circles if one.key not in (ring.key, ring.twin)]
+            left = [circle for circle in sides.circles if circle.key not in (ring.key, ring.twin)]
             yield replace(sides, circles=tuple(left))
 
 
 def _lines(sides: Sides) -> dict[int, Line]:
     """Return the line of every straight side by its key."""
     return {
-        sides.loops[one.loop].sides[one.side].key: one.piece.curve
-        for one in sides.placed
-        if isinstance(one.piece.curve, Line)
+        sides.loops[item.loop].sides[item.side].key: item.piece.curve
+        for item in sides.placed
+        if isinstance(item.piece.curve, Line)
     }
 
 
@@ -93,9 +93,9 @@ def _length(sides: Sides, key: int) -> float:
 def _drawn(sides: Sides, i: int) -> list[Drawn]:
     """Return the sides of a loop with where they begin and end."""
     return [
-        Drawn(sides.loops[i].sides[one.side], one.piece.curve.start, one.piece.curve.end)
-        for one in sides.placed
-        if one.loop == i and not one.fillet
+        Drawn(sides.loops[i].sides[item.side], item.piece.curve.start, item.piece.curve.end)
+        for item in sides.placed
+        if item.loop == i and not item.fillet
     ]
 
 
@@ -136,9 +136,9 @@ def _without(
             loops.append(loop)
             continue
         drawn = [
-            replace(one, side=new.get(one.side.key, one.side))
-            for one in _drawn(sides, i)
-            if one.side.key not in gone
+            replace(item, side=new.get(item.side.key, item.side))
+            for item in _drawn(sides, i)
+            if item.side.key not in gone
         ]
         made = _looped(sides, drawn, limits, outer, _radii(sides))
         if made is None:

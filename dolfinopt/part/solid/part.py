@@ -143,40 +143,40 @@ class SolidPart:
     @property
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
-        one, found = self.domain, []
-        found += one.gray_words
+        domain, result = self.domain, []
+        result += domain.gray_words
         if self.pieces:
             pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
-            share = 100.0 * self.pieces_volume / one.volume
-            found.append(
-                f"arm {one.name!r}: {pieces} without a joint to both interfaces "
+            share = 100.0 * self.pieces_volume / domain.volume
+            result.append(
+                f"arm {domain.name!r}: {pieces} without a joint to both interfaces "
                 f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
             )
         if len(self.cavities):
             places = "; ".join("({:.1f}, {:.1f}, {:.1f})".format(*at) for at in 1e3 * self.cavities)
-            found.append(
-                f"arm {one.name!r}: closed cavities at {places} mm, which no tool and no powder "
+            result.append(
+                f"arm {domain.name!r}: closed cavities at {places} mm, which no tool and no powder "
                 "leaves; [[arms.regions]] keeps a way out void"
             )
-        return found + self._narrow()
+        return result + self._narrow()
 
     def _narrow(self) -> list[str]:
         """Return what is said of members and gaps narrower than asked for, or than the filter."""
-        one = self.domain
-        found: dict[str, list[str]] = {}
+        domain = self.domain
+        result: dict[str, list[str]] = {}
         for name, width, asked, key in (
-            ("thinnest member", self.widths.member, one.minimum_member, "minimum_member"),
-            ("narrowest gap", self.widths.gap, one.minimum_gap, "minimum_gap"),
+            ("thinnest member", self.widths.member, domain.minimum_member, "minimum_member"),
+            ("narrowest gap", self.widths.gap, domain.minimum_gap, "minimum_gap"),
         ):
             limit = f"{key}, {1e3 * asked:.3g} mm"
             if asked == 0.0:
-                asked = one.filter_radius
+                asked = domain.filter_radius
                 limit = f"the filter's radius, {1e3 * asked:.3g} mm"
             if width is not None and width < NARROW * asked:
-                found.setdefault(limit, []).append(f"its {name} is {1e3 * width:.2g} mm wide")
+                result.setdefault(limit, []).append(f"its {name} is {1e3 * width:.2g} mm wide")
         return [
-            f"arm {one.name!r}: {' and '.join(words)}, below {limit}"
-            for limit, words in found.items()
+            f"arm {domain.name!r}: {' and '.join(words)}, below {limit}"
+            for limit, words in result.items()
         ]
 
     def figures(self, density: float) -> dict[str, Any]:
@@ -281,9 +281,9 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
     free[surface.triangles[~inner]] = False
     walls = [domain.own, domain.kept]
     smooth = smooth_surface(surface, inner, free, domain.cell, np.concatenate(walls), domain.crisp)
-    found = _uncrossed(surface, smooth, free, domain.volume)
-    distance = float(np.linalg.norm(found.points - surface.points, axis=1).max())
-    if abs(found.volume - domain.volume) > SAME_VOLUME * domain.volume or (
+    result = _uncrossed(surface, smooth, free, domain.volume)
+    distance = float(np.linalg.norm(result.points - surface.points, axis=1).max())
+    if abs(result.volume - domain.volume) > SAME_VOLUME * domain.volume or (
         distance > FURTHEST * domain.cell
     ):
         raise InputError(
@@ -292,8 +292,8 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
             f"encloses {1e9 * surface.volume:.6g} mm3; the design is too grey for a part; optimise "
             'with design.projection = "robust" until it is crisp'
         )
-    check_surface(domain.name, found)
-    return SolidPart(domain, found, level, distance, pieces, lost)
+    check_surface(domain.name, result)
+    return SolidPart(domain, result, level, distance, pieces, lost)
 
 
 def _uncrossed(surface: Surface, smooth: Surface, free: np.ndarray, volume: float) -> Surface:
@@ -305,12 +305,12 @@ def _uncrossed(surface: Surface, smooth: Surface, free: np.ndarray, volume: floa
     move = smooth.points - surface.points
     for _ in range(ROUNDS):
         now = replace(surface, points=surface.points + share[:, None] * move)
-        found = with_volume(now, free & (share > 0.0), volume)
-        crossed = crossings(found)
+        result = with_volume(now, free & (share > 0.0), volume)
+        crossed = crossings(result)
         if not len(crossed):
             break
         near = np.zeros(len(share), dtype=bool)
         near[surface.triangles[crossed]] = True
         near[surface.triangles[near[surface.triangles].any(axis=1)]] = True
         share = np.where(near, np.where(share > LEAST_SHARE, 0.5 * share, 0.0), share)
-    return found
+    return result

@@ -132,8 +132,8 @@ def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.nda
     nodes = np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[27]], nodes)
     sizes = cell_sizes(corners)
     weight, total = (
-        np.bincount(nodes.ravel(), np.repeat(one, 27), len(points))
-        for one in (sizes, sizes * density)
+        np.bincount(nodes.ravel(), np.repeat(item, 27), len(points))
+        for item in (sizes, sizes * density)
     )
     return points, nodes, total / weight
 
@@ -167,7 +167,7 @@ def forty_eighths(nodes: np.ndarray) -> np.ndarray:
 def _forty_eighths() -> np.ndarray:
     """Return the rows (48, 4) of `forty_eighths`, of positive volume."""
     places = np.array([[x, y, z] for z in (0, 1, 2) for y in (0, 1, 2) for x in (0, 1, 2)])
-    found = []
+    result = []
     odd = (places != 1).sum(axis=1)  # of a corner 3, of an edge 2, of a face 1, of the centre 0
     for face in np.flatnonzero(odd == 1):
         for edge in np.flatnonzero(odd == 2):
@@ -177,8 +177,8 @@ def _forty_eighths() -> np.ndarray:
                     (steps[1] == 0) | (steps[1] == steps[2])
                 ).all():
                     turned = np.linalg.det(steps) < 0.0
-                    found.append([13, face, *((corner, edge) if turned else (edge, corner))])
-    return np.array(found)
+                    result.append([13, face, *((corner, edge) if turned else (edge, corner))])
+    return np.array(result)
 
 
 FORTY_EIGHTHS = _forty_eighths()
@@ -215,8 +215,8 @@ def _cut(
 ) -> Surface:
     """Return the surface of what of the cells is above a level."""
     fields = fields or {}
-    surface, found = outside(cut(points, nodes, values, level, fields))
-    carried = {name: found[name].reshape(-1, *one.shape[1:]) for name, one in fields.items()}
+    surface, result = outside(cut(points, nodes, values, level, fields))
+    carried = {name: result[name].reshape(-1, *item.shape[1:]) for name, item in fields.items()}
     return replace(surface, fields=carried)
 
 
@@ -256,12 +256,12 @@ def outside(solid: Any) -> tuple[Surface, dict[str, np.ndarray]]:
     faces.SetInputData(solid)
     faces.PassThroughCellIdsOn()
     faces.Update()
-    found = pyvista.PolyData(faces.GetOutput()).triangulate().clean()
-    triangles = found.faces.reshape(-1, 4)[:, 1:].astype(int)
-    within = solid.cell_centers().points[found.cell_data["vtkOriginalCellIds"]]
-    surface = _outwards(np.asarray(found.points, dtype=float), triangles, within)
-    values = {name: np.asarray(found.point_data[name]) for name in found.point_data}
-    return replace(surface, cells=np.asarray(found.cell_data["cell"])), values
+    result = pyvista.PolyData(faces.GetOutput()).triangulate().clean()
+    triangles = result.faces.reshape(-1, 4)[:, 1:].astype(int)
+    within = solid.cell_centers().points[result.cell_data["vtkOriginalCellIds"]]
+    surface = _outwards(np.asarray(result.points, dtype=float), triangles, within)
+    values = {name: np.asarray(result.point_data[name]) for name in result.point_data}
+    return replace(surface, cells=np.asarray(result.cell_data["cell"])), values
 
 
 def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> Surface:
@@ -281,9 +281,9 @@ def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> 
     edges, sides = np.sort(edges, axis=1)[order], order % count
     forth = (triangles[:, [0, 1, 2]] < triangles[:, [1, 2, 0]]).T.ravel()[order]
     pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
-    one, other, alike = sides[pair], sides[pair + 1], forth[pair] != forth[pair + 1]
+    side, other, alike = sides[pair], sides[pair + 1], forth[pair] != forth[pair + 1]
     # Every triangle as it is, 0 ... m - 1, and turned, m ... 2 m - 1: which go together.
-    start, end = np.concatenate([one, one + count]), np.where(alike, other, other + count)
+    start, end = np.concatenate([side, side + count]), np.where(alike, other, other + count)
     end = np.concatenate([end, (end + count) % (2 * count)])
     links = sp.csr_matrix((np.ones(len(start)), (start, end)), shape=(2 * count, 2 * count))
     sheet = connected_components(links, directed=False)[1]
@@ -354,8 +354,8 @@ def distance_to_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     corners = faces.reshape(-1, 3)
     around = np.arange(len(corners), dtype=int).reshape(faces.shape[:2])
-    found = pyvista.PolyData.from_regular_faces(corners, around)
-    _, nearest = found.find_closest_cell(points, return_closest_point=True)
+    result = pyvista.PolyData.from_regular_faces(corners, around)
+    _, nearest = result.find_closest_cell(points, return_closest_point=True)
     return np.asarray(np.linalg.norm(np.asarray(nearest) - points, axis=1))
 
 
@@ -387,12 +387,12 @@ def with_volume(surface: Surface, free: np.ndarray, volume: float) -> Surface:
 def area_vectors(surface: Surface) -> np.ndarray:
     """Return the derivative (n, 3) of the volume by the points, m2."""
     a, b, c = surface.corners.swapaxes(0, 1)
-    found = np.zeros_like(surface.points)
+    result = np.zeros_like(surface.points)
     for corner, across in zip(
         surface.triangles.T, (np.cross(b, c), np.cross(c, a), np.cross(a, b)), strict=True
     ):
-        np.add.at(found, corner, across / 6.0)
-    return found
+        np.add.at(result, corner, across / 6.0)
+    return result
 
 
 def crossings(surface: Surface) -> np.ndarray:
@@ -408,18 +408,18 @@ def crossings(surface: Surface) -> np.ndarray:
     start, end = surface.points[edges].swapaxes(0, 1)
     centres = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
-    found = []
+    result = []
     tree, middle = cKDTree(centres), 0.5 * (start + end)
     reach = 0.5 * np.linalg.norm(end - start, axis=1) + radii.max(initial=0.0)
     for part in np.array_split(np.arange(len(edges)), max(1, len(edges) * CANDIDATES // MANY)):
         near = tree.query_ball_point(middle[part], reach[part])
-        edge = np.repeat(part, [len(one) for one in near])
+        edge = np.repeat(part, [len(item) for item in near])
         triangle = np.concatenate([*near, []]).astype(int)
         apart = (edges[edge][:, :, None] != triangles[triangle][:, None]).all(axis=(1, 2))
         edge, triangle = edge[apart], triangle[apart]
         through = _passes(start[edge], end[edge], corners[triangle])
-        found.append(np.column_stack([owners[edge[through]], triangle[through]]))
-    return np.concatenate(found) if found else np.empty((0, 2), dtype=int)
+        result.append(np.column_stack([owners[edge[through]], triangle[through]]))
+    return np.concatenate(result) if result else np.empty((0, 2), dtype=int)
 
 
 def open_edges(surface: Surface) -> np.ndarray:
@@ -443,7 +443,7 @@ def cavities(surface: Surface) -> np.ndarray:
     a, b, c = surface.corners.swapaxes(0, 1)
     of = sheet[triangles[:, 0]]
     volume = np.bincount(of, np.einsum("na,na->n", a, np.cross(b, c)), sheets)
-    middle = np.stack([np.bincount(of, one, sheets) for one in surface.corners.mean(axis=1).T])
+    middle = np.stack([np.bincount(of, item, sheets) for item in surface.corners.mean(axis=1).T])
     return np.asarray((middle / np.bincount(of, minlength=sheets).clip(1)).T[volume < 0.0])
 
 
@@ -527,16 +527,16 @@ class _Field:
 def _field(domain: SolidDomain) -> _Field:
     corners, density = domain.corners, domain.field
     faces = {name: getattr(domain, name) for name in MARKS}
-    faces |= {FURTHER + name: one for name, one in domain.further.items()}
+    faces |= {FURTHER + name: item for name, item in domain.further.items()}
     is_box = domain.is_box
     if corners.shape[1] == 8 and (len(corners) <= FEW or not is_box):
         points, nodes, values = halved(corners, density)
         cells = eighths(nodes) if is_box else forty_eighths(nodes)
-        faces = {name: middles(one) for name, one in faces.items()}
+        faces = {name: middles(face) for name, face in faces.items()}
     else:
         points, nodes, values = nodal_densities(corners, density)
         cells = nodes
-    marks = {name: _among(points, one) for name, one in faces.items()}
+    marks = {name: _among(points, face) for name, face in faces.items()}
     marks["stays"] = np.zeros(len(points))
     marks["stays"][nodes[domain.passive]] = 1.0
     values[(marks["inboard"] > 0.0) | (marks["outboard"] > 0.0)] = values.max()
@@ -563,7 +563,7 @@ def at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:
             f"arm {domain.name!r}: its design does not hang together: no material joins both "
             "interfaces; optimise longer, or with a larger design.volume_fraction"
         )
-    _, level, whole, joined = min(tried, key=lambda one: one[0])
+    _, level, whole, joined = min(tried, key=lambda item: item[0])
     count = _number_of_pieces(whole) - _number_of_pieces(joined)
     lost = outside(whole)[0].volume - outside(joined)[0].volume if count else 0.0
     return level, joined, count, lost
@@ -579,8 +579,8 @@ def _among(points: np.ndarray, some: np.ndarray) -> np.ndarray:
 
 def _regions(solid: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return which piece of a grid its points and its cells belong to."""
-    found = solid.connectivity()
-    return np.asarray(found.point_data["RegionId"]), np.asarray(found.cell_data["RegionId"])
+    result = solid.connectivity()
+    return np.asarray(result.point_data["RegionId"]), np.asarray(result.cell_data["RegionId"])
 
 
 def _number_of_pieces(solid: Any) -> int:
@@ -597,7 +597,7 @@ def _joined(solid: Any) -> Any:
     both = np.intersect1d(*ends)
     more = [name for name in solid.point_data if name.startswith(FURTHER)]
     marked = [of_points[solid.point_data[name] > WHOLE] for name in more]
-    if not len(both) or not all(np.isin(one, both).any() for one in marked):
+    if not len(both) or not all(np.isin(item, both).any() for item in marked):
         return None
     stays = np.isin(of_cells, both)
     return solid if stays.all() else solid.extract_cells(stays)

@@ -80,12 +80,12 @@ def _narrowest(
     cell: Any = mutable(0)
     hit: tuple[Any, ...] = (0.0, t, [0.0] * 3, [0.0] * 3, mutable(0), cell)
     first, last = reach
-    found = []
+    result = []
     for start, way in zip(points, along, strict=True):
         if locator.IntersectWithLine(start + first * way, start + last * way, *hit):
             if sense * normal[int(cell)] @ way > FACING:
-                found.append(first + float(t) * (last - first))
-    return min(found, default=None)
+                result.append(first + float(t) * (last - first))
+    return min(result, default=None)
 
 
 def _places(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -99,7 +99,7 @@ def _places(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, f
     number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
     second, third = ((1.0 / 3.0 + number * step) % 1.0 for step in EVENLY)
     beyond = second + third > 1.0
-    second, third = (np.where(beyond, 1.0 - one, one) for one in (second, third))
+    second, third = (np.where(beyond, 1.0 - item, item) for item in (second, third))
     weights = np.stack([1.0 - second - third, second, third], axis=1)
     points = np.einsum("nk,nka->na", weights, surface.corners[which])
     return points, normal[which] / area[which, None], spacing
