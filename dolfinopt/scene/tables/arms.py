@@ -265,10 +265,10 @@ class Arm(Table):
         None, "centre of mass of a rigid arm in space, in the arm's frame; default: halfway [m]"
     )
     joint_mass: float = setting(
-        0.0, "mass at the outboard interface: motor, gearbox, bearing [kg]", ge=0, le=1e9
+        0.0, "mass at the outboard interface: motor, gearbox, bearing [kg]", ge=0, le=1e6
     )
     joint_inertia: float = setting(
-        0.0, "moment of inertia at the outboard interface [kg m2]", ge=0, le=1e9
+        0.0, "moment of inertia at the outboard interface [kg m2]", ge=0, le=1e6
     )
     rotor_inertia: RotorInertia = 0.0
     gear_ratio: GearRatio = None
