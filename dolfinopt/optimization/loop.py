@@ -92,6 +92,11 @@ def run(
     return _Run(evaluator, recorder, report, compared, x0).go(memory)
 
 
+def begins_with_frozen_loads(scene: Scene) -> bool:
+    """Return whether the exact gradient takes over from one with frozen loads."""
+    return scene.objective.gradient == "exact" and scene.objective.has_esl_gradient
+
+
 class _Run:
     """One optimisation under way."""
 
@@ -152,8 +157,8 @@ class _Run:
     def _begin(self) -> None:
         """Choose gradient and coordinates for the initial design (collective)."""
         scene = self.scene
-        if scene.objective.gradient == "exact" and scene.objective.has_esl_gradient:
-            self.evaluator.use_gradient("esl")  # the exact one takes over
+        if begins_with_frozen_loads(scene):
+            self.evaluator.use_gradient("esl")
         elif scene.objective.gradient == "exact":
             self.exact_from = 0
         if needs(scene, "motion"):

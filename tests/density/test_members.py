@@ -265,8 +265,8 @@ def test_which_design_carries_the_volume(width):
 ROBUSTLY = "design.projection=robust"
 TALL = (ROBUSTLY, "arms.height=0.3", "arms.cells=[200,60]")
 REFUSED = [  # keys changed; key, value and what is expected
-    (["design.minimum_member=0.015"], ("minimum_member = 0.015", 'design.projection = "robust"')),
-    (["design.minimum_gap=0.015"], ("minimum_gap = 0.015", 'design.projection = "robust"')),
+    (["design.minimum_member=0.015"], ("minimum_member = 0.015", 'with projection = "robust"')),
+    (["design.minimum_gap=0.015"], ("minimum_gap = 0.015", 'with projection = "robust"')),
     (["design.minimum_member=-1.0"], ("minimum_member = -1", ">= 0")),
     ([ROBUSTLY, "design.minimum_member=0.014"], ("minimum_member = 0.014", "3 cells", "0.015 [m]")),
     ([ROBUSTLY, "design.minimum_gap=0.014"], ("minimum_gap = 0.014", "3 cells", "0.015 [m]")),

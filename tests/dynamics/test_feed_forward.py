@@ -173,7 +173,7 @@ def test_splines_rest_at_their_ends() -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (("feed_forward.lead=0.1",), "expected none without feed_forward.kind"),
+        (("feed_forward.lead=0.1",), 'only with kind = "tip"'),
         (("feed_forward.kind=toe",), 'feed_forward.kind = "toe"'),
         ((TIP, "feed_forward.spacing=0"), "feed_forward.spacing = 0"),
         ((TIP, "feed_forward.lead=-1"), "feed_forward.lead = -1"),

@@ -168,11 +168,11 @@ class Table(BaseModel):
             choice = getattr(self, use.choice)
             if choice in use.values.split() if use.values else choice:
                 continue
-            result = f"with {use.choice} = {shown(choice)}, which does not use it"
+            reason = f"with {use.choice} = {shown(choice)}: it is {use.words}"
             if choice is None:
-                result = f"without {use.choice}"
+                reason = f"without {use.choice}"
             for key in use.keys.split():
-                self.refuse_stated(key, result, use.choice)
+                self.refuse_stated(key, reason, use.choice)
         return self
 
     def refuse_stated(self, key: str, reason: str, *others: str) -> None:
