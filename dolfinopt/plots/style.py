@@ -175,7 +175,7 @@ def decimals(t: np.ndarray) -> int:
 
 # What all figures share, in Matplotlib's own words; words are text, no formulas.
 DPI = 110  # px per inch
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "figure.dpi": DPI,
     "axes.titlelocation": "left",
     "axes.titlesize": 10,
