@@ -143,11 +143,11 @@ def _sampled(
     late = (h * tau)[:, None] * by_rates[0]
     if len(by_rates) > 1:
         late += by_rates[1]
-    result, first = np.unique(step, return_index=True)  # instants of a step lie side by side
+    steps, first = np.unique(step, return_index=True)  # instants of a step lie side by side
     by_a = np.zeros_like(solution.a)
     by_y = np.zeros((len(solution.a), 2, by_rates.shape[2]))
-    by_a[result] = np.add.reduceat(by_instant, first)
-    by_y[result] = np.add.reduceat(np.stack([by_rates[0], late], axis=1), first)
+    by_a[steps] = np.add.reduceat(by_instant, first)
+    by_y[steps] = np.add.reduceat(np.stack([by_rates[0], late], axis=1), first)
     return by_a, by_y
 
 
