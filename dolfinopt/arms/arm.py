@@ -301,8 +301,14 @@ class Arm:
             return
         self.coordinates = num_modes
         self.initial.basis = None
+        self._renew()
+
+    def _renew(self) -> None:
+        """Let the state be that of the same design under what has changed."""
         if self._state is not None:
-            self._state = self._state.under(self.scene, num_modes, self.initial, self.stiffened)
+            self._state = self._state.under(
+                self.scene, self.coordinates, self.initial, self.stiffened
+            )
 
     @property
     def stiffened(self) -> bool:
@@ -314,10 +320,8 @@ class Arm:
     def set_stiffening(self, stiffening: Stiffening) -> None:
         """Give bodies geometric stiffness from now on, or none."""
         before, self.stiffening = self.stiffened, stiffening
-        if self._state is not None and self.stiffened != before:
-            self._state = self._state.under(
-                self.scene, self.coordinates, self.initial, self.stiffened
-            )
+        if self.stiffened != before:
+            self._renew()
 
     def under(self, scene: scenes.Scene) -> Arm:
         """Return this arm in a scene that differs in what it does, not in what it is.
@@ -336,10 +340,7 @@ class Arm:
             other.stiffening = None
         if same_basis(self.scene, scene) and self.basis is not None:
             other.initial.basis = self.initial.basis
-        if self._state is not None:
-            other._state = self._state.under(
-                scene, other.coordinates, other.initial, other.stiffened
-            )
+        other._renew()
         return other
 
     def fresh(self) -> Arm:
@@ -383,16 +384,17 @@ class Arm:
 
     def volume_fraction(self, x_phys: np.ndarray) -> float:
         """Return the solid volume over the largest one (collective on the arm)."""
-        parts = np.array([self.mesh.area @ self.kind.filled(x_phys), self.mesh.area.sum()])
-        volume, total = self.mesh.comm.allreduce(parts)
-        return float(volume / total)
+        return self._mean(self.kind.filled(x_phys))
 
     def grayness(self, x_phys: np.ndarray) -> float:
         """Return 4 mean x (1 - x) over the arm's cells: 0 is crisp, 1 all grey; eq. (12)."""
         x = self.kind.share(x_phys)
-        parts = np.array([self.mesh.area @ (4.0 * x * (1.0 - x)), self.mesh.area.sum()])
-        grey, total = self.mesh.comm.allreduce(parts)
-        return float(grey / total)
+        return self._mean(4.0 * x * (1.0 - x))
+
+    def _mean(self, values: np.ndarray) -> float:
+        parts = np.array([self.mesh.area @ values, self.mesh.area.sum()])
+        amount, total = self.mesh.comm.allreduce(parts)
+        return float(amount / total)
 
     def contacts(self, solid: np.ndarray) -> Contacts:
         """Return how solid cells hang together; `kept` are this rank's (collective on the arm).

@@ -17,7 +17,7 @@ from dolfinopt.density.measured import LEAST_SIDE_DISTANCE, MIRROR_DISTANCE_LIMI
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
-from dolfinopt.mesh.checks import cell_centroids, facet_areas, facet_corners, facet_middles
+from dolfinopt.mesh.checks import facet_areas, facet_corners, facet_middles
 from dolfinopt.mesh.measured import FILE_ROUNDING_SHARE
 from dolfinopt.scene.load import Arm
 from dolfinopt.solver import conjugate_gradients, direct_solver, obeying_options
@@ -162,7 +162,7 @@ def _sides(mesh: ArmMesh, open_edges: bool) -> _Sides:
     facets = corners[:, np.array(facet_corners(mesh.dim, corners.shape[1]))]
     flat = facets.reshape(-1, *facets.shape[2:])
     vector = facet_areas(flat).reshape(*facets.shape[:2], -1)
-    arm = facet_middles(flat).reshape(vector.shape) - cell_centroids(corners)[:, None]
+    arm = facet_middles(flat).reshape(vector.shape) - mesh.centroid[:, None]
     length = np.linalg.norm(vector, axis=2)
     outward = np.sign(np.einsum("nki,nki->nk", vector, arm))
     normal = vector * (outward / length)[..., None]

@@ -69,12 +69,13 @@ class CellMatrix:
         self._pairs, self.pattern = pairs, pairs.pattern
         size, n = elements.shape[1], pairs.width
         self.block = b = size // n
-        blocks = elements.reshape(-1, n, b, n, b).swapaxes(2, 3).reshape(-1, b * b)
-        self._blocks, self._places = blocks, pairs.place
+        places, cell, self._places = np.arange(n * n), 0, pairs.place
         if len(elements) != 1:
             # In the order of the entries that they add to: read from one end to the other.
-            self._blocks = blocks[pairs.cell.astype(np.int64) * n * n + pairs.place]
-            self._places = np.arange(len(self._blocks), dtype=np.int32)
+            places, cell = pairs.place, pairs.cell
+            self._places = np.arange(len(places), dtype=np.int32)
+        blocks = elements.reshape(-1, n, b, n, b)[cell, places // n, :, places % n]
+        self._blocks = blocks.reshape(-1, b * b)
 
     def assemble(self, scale: np.ndarray) -> sp.csr_matrix | sp.bsr_matrix:
         """Return the matrix of `scale` (n_cells,); all share one pattern, each has its values."""

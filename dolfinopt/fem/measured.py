@@ -12,9 +12,9 @@ ALIKE_CELLS_ERROR = 1e-11
 # cells at a time, for more modes.
 STRESS_CHUNK_ENTRIES = 120_000
 STRESS_CHUNK_CELLS = 256
-# Cells, times cubes of their nodes, whose matrices are computed at a time: 100 MB; and entries of
-# nodal fields that are copied at a time.
-KERNEL_CHUNK_ENTRIES = 2_000_000
+# Cells, times cubes of their nodes, whose matrices are computed at a time: 2 MB; with 40 MB a mesh
+# of 17 280 hexahedra takes 5 % longer. And entries of nodal fields that are copied at a time.
+KERNEL_CHUNK_ENTRIES = 100_000
 
 # -- interface -------------------------------------------------------------------------------
 

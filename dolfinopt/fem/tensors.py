@@ -102,10 +102,14 @@ class ElementTensors:
         alike = None if self.law.ndim == 3 else alike
         self._coordinates = coordinates if alike is None else alike[None]
         self.corners = coordinates[:, :, : mesh.dim]
-        n = mesh.dim * self.cells.shape[1]
-        parts = [condensed(k, n) for _, (k,) in self._tabulated(forms.stiffness)]
-        k, self.recovery, self.modal = map(np.concatenate, zip(*parts, strict=True))
-        self.stiffness = self.thickness * k
+        n, [kernel] = mesh.dim * self.cells.shape[1], self.kernels(forms.stiffness)
+        count, size = len(self._coordinates), kernel.shape[0]
+        # Filled run by run: new memory takes as long as what is computed.
+        self.stiffness = np.empty((count, n, n))
+        self.recovery, self.modal = np.split(np.empty((count, size - n, size)), [n], axis=2)
+        for part, (k,) in self._tabulated(forms.stiffness):
+            self.stiffness[part], self.recovery[part], self.modal[part] = condensed(k, n)
+        self.stiffness *= self.thickness
         self.mass = self.thickness * np.concatenate([m for _, (m,) in self._tabulated(forms.mass)])
 
     def _tabulated(

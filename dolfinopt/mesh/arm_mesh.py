@@ -189,7 +189,7 @@ def file_arm(comm: MPI.Comm, arm: scenes.Arm) -> ArmMesh:
                 zip(arm.further_interfaces, arm.interface_points[1:])
             )
         )
-        mesh.passive[:] |= _distance(mesh.centroid, facets) < arm.solid_ends
+        mesh.passive[:] |= _near(mesh.centroid, facets, arm.solid_ends)
     return replace(mesh, notes=notes, further=further)
 
 
@@ -263,21 +263,27 @@ def _all_cells(mesh: ArmMesh) -> Cells:
     return Cells(*(np.concatenate(parts) for parts in zip(*mesh.comm.allgather(mine), strict=True)))
 
 
-def _distance(points: np.ndarray, facets: np.ndarray) -> np.ndarray:
-    """Return the distance (n,) of points (n, d) from the nearest of lines, or of points.
+def _near(points: np.ndarray, facets: np.ndarray, limit: float) -> np.ndarray:
+    """Return (n,) True for points (n, d) nearer than a limit to one of lines, or of points.
 
     Args:
         points: m.
         facets: lines (m, 2, 2), or points (m, 1, 3).
+        limit: m.
     """
-    nearest = np.full(len(points), np.inf)
-    if facets.shape[1] == 1 and len(facets):
-        return np.asarray(cKDTree(facets[:, 0]).query(points)[0])
-    for a, b in facets:
-        along = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
-        distance = np.linalg.norm(points - a - along[:, None] * (b - a), axis=1)
-        np.minimum(nearest, distance, out=nearest)
-    return nearest
+    if limit <= 0.0 or not len(facets):
+        return np.zeros(len(points), dtype=bool)
+    begins, ways = facets[:, 0], facets[:, -1] - facets[:, 0]
+    # Of cells further from all middles no line can be near: with all cells six times slower.
+    far = limit + 0.5 * np.linalg.norm(ways, axis=1).max()
+    near = cKDTree(facets.mean(axis=1)).query(points)[0] < far
+    close, least = points[near], np.full(near.sum(), np.inf)
+    for begin, way in zip(begins, ways, strict=True):
+        share = (close - begin) @ way / max(way @ way, np.finfo(float).tiny)
+        apart = close - begin - np.clip(share, 0.0, 1.0)[:, None] * way
+        np.minimum(least, np.einsum("ni,ni->n", apart, apart), out=least)
+    near[near] = least < limit**2
+    return near
 
 
 def neighbours(mesh: Any) -> np.ndarray:

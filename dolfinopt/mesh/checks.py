@@ -264,32 +264,13 @@ def edge_lengths(dim: int, corners: np.ndarray) -> np.ndarray:
 
 def cell_sizes(corners: np.ndarray) -> np.ndarray:
     """Return areas or volumes (n,) of cells with corners (n, c, d) in DOLFINx's order."""
-    return _jacobians(corners) @ _tabulated(corners)[0]
-
-
-def cell_centroids(corners: np.ndarray) -> np.ndarray:
-    """Return the centroids (n, d) of cells with corners (n, c, d), m."""
-    weights, functions = _tabulated(corners)
-    volumes = _jacobians(corners) * weights
-    moments = np.einsum("ep,pn,eni->ei", volumes, functions[0], corners)
-    return moments / volumes.sum(axis=1, keepdims=True)
-
-
-def _jacobians(corners: np.ndarray) -> np.ndarray:
-    """Return |det J| (n, p) at the points of a rule that is exact for volumes and centroids."""
-    J = np.einsum("eni,kpn->epik", corners, _tabulated(corners)[1][1:])
-    return np.abs(np.linalg.det(J))
-
-
-def _tabulated(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return weights (p,), and the corners' functions and their derivatives (1 + d, p, c)."""
-    kind = KINDS[corners.shape[2], corners.shape[1]]
+    _, count, dim = corners.shape
+    kind = KINDS[dim, count]
     # The Jacobian of tensor products is of second degree in each direction.
-    points, weights = basix.make_quadrature(
-        kind, 3 if corners.shape[1] > corners.shape[2] + 1 else 1
-    )
-    element = basix.create_element(basix.ElementFamily.P, kind, 1)
-    return weights, element.tabulate(1, points)[..., 0]
+    points, weights = basix.make_quadrature(kind, 3 if count > dim + 1 else 1)
+    by_xi = basix.create_element(basix.ElementFamily.P, kind, 1).tabulate(1, points)[1:, ..., 0]
+    J = np.tensordot(corners, by_xi, (1, 2)).transpose(0, 3, 1, 2)
+    return np.asarray(np.abs(np.linalg.det(J)) @ weights)
 
 
 def facet_areas(corners: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 import tempfile
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,7 @@ def check_start(path: Path) -> None:
         raise InputError(f"it is not {kind}; export it again, or give the file its own ending")
 
 
+@lru_cache(maxsize=4)  # a file with parameters is opened twice
 def checked_geo(text: str) -> str:
     """Return a .geo text for Gmsh: the same statements on the same lines, without comments.
 
