@@ -13,6 +13,8 @@ doi:10.1137/151002769.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from dolfinopt.dynamics.collocation import (
@@ -56,6 +58,7 @@ class Adjoint:
         self._instants = system.at_stages(solution.time_grid, method.c)
         self._rates = tuple(x.reshape(-1, q.shape[2]) for x in (q, qd, solution.a))
         self._kept: dict[bytes, _Factors] = {}
+        self._by_command: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def gradient(self, t: np.ndarray, by_q: np.ndarray) -> list[ShapeIntegrals]:
         """Return dJ/d(constants) of every body through the trajectory's coordinates.
@@ -81,10 +84,21 @@ class Adjoint:
         through_start = self.system.start_gradient(self.solution.q[0], by_start)
         return add_gradients(gradient, through_start) if through_start else gradient
 
-    @property
+    @cached_property
     def state(self) -> MachineState:
         """The system at all stages."""
         return self._instants.state(*self._rates)
+
+    def by_command(self, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return derivatives by desired coordinates: of rows (n s, S, F, 3), of the start (S, F).
+
+        They are kept: every response of a motion asks for the same.
+        """
+        key = joints.tobytes()
+        if key not in self._by_command:
+            start = self.system.start_by_command(self.solution.q[0], joints)
+            self._by_command[key] = self.state.by_command(joints), start
+        return self._by_command[key]
 
     def _backwards(self, by_a: np.ndarray, by_y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the multipliers (n, s, N) and dJ by the coordinates at the very beginning (N,)."""

@@ -64,6 +64,8 @@ from dolfinopt.scene.tables.motion import Simulation
 
 # -- corrections -----------------------------------------------------------------------------
 
+Functions = tuple[Callable[[np.ndarray], np.ndarray], ...]
+
 
 @dataclass(frozen=True, eq=False)
 class Splines:
@@ -75,8 +77,8 @@ class Splines:
 
     knots: np.ndarray
 
-    @cached_property
-    def _every(self) -> tuple[Callable[[np.ndarray], np.ndarray], ...]:
+    def of(self, coefficients: np.ndarray) -> Functions:
+        """Return the curve of coefficients (p, F) and two derivatives, functions of t (n,), s."""
         from scipy.interpolate import BSpline  # takes as long to import as NumPy
 
         ends = self.knots[[0, -1]]
@@ -84,10 +86,13 @@ class Splines:
             [np.repeat(ends[0], SPLINE_DEGREE), self.knots, np.repeat(ends[1], SPLINE_DEGREE)]
         )
         # The first three coefficients are equal, and so are the last three.
-        count = len(self.knots) + SPLINE_DEGREE - 1
-        tie = np.repeat(np.eye(count - 4), [3, *[1] * (count - 6), 3], axis=0)
-        spline = BSpline(knots, tie, SPLINE_DEGREE)
+        tied = np.repeat(coefficients, [3, *[1] * (self.count - 2), 3], axis=0)
+        spline = BSpline(knots, tied, SPLINE_DEGREE)
         return spline, spline.derivative(1), spline.derivative(2)
+
+    @cached_property
+    def _every(self) -> Functions:
+        return self.of(np.eye(self.count))
 
     @property
     def count(self) -> int:
@@ -96,7 +101,7 @@ class Splines:
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return all splines, their rates and accelerations (3, n, p) at instants t (n,), s."""
-        return np.stack([item(t) for item in self._every])
+        return np.stack([function(t) for function in self._every])
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +118,13 @@ class Corrections:
     splines: Splines
     coefficients: np.ndarray
 
+    @cached_property
+    def _curve(self) -> Functions:
+        return self.splines.of(self.coefficients)
+
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return corrections, rates and accelerations (3, n, F)."""
-        return self.splines.at(t) @ self.coefficients
+        return np.stack([function(t) for function in self._curve])
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,8 +256,9 @@ def tip_response(
     state = instants.state(*(x.reshape(-1, S) for x in (q, qd, solution.a)))
     n, s = solution.a.shape[:2]
     basis = splines.at(stage_instants(solution.time_grid, method.c))
-    loads = np.einsum("nrfk,knp->nrpf", state.by_command(joints), basis)
-    loads = np.concatenate([loads.reshape(n * s, S, -1), state.residual()[:, :, None]], axis=2)
+    loads = state.by_command(joints).reshape(n * s, -1, 3) @ basis.swapaxes(0, 1)
+    loads = loads.reshape(n * s, S, len(joints), -1).swapaxes(2, 3).reshape(n * s, S, -1)
+    loads = np.concatenate([loads, state.residual()[:, :, None]], axis=2)
     matrix = matrix_of(stages, instants.linearise(*state.rates), np.arange(S))
     forced = -(matrix.inverse @ loads.reshape(n, s * S, -1))
     gain = end_gain(stages, forced.reshape(n, s, S, -1))
@@ -436,11 +446,11 @@ def by_coefficients(
     joints, splines, (rows, by_start) = corrections.joints, corrections.splines, multipliers
     solution = adjoint.solution
     at = stage_instants(solution.time_grid, solution.nodes)
-    by_stage = np.einsum("ns,nsfk->knf", rows, adjoint.state.by_command(joints))
+    by_command, first = adjoint.by_command(joints)
+    by_stage = np.einsum("ns,nsfk->knf", rows, by_command)
     own = by_motion[:, :, joints]
-    total = np.einsum("knp,knf->pf", splines.at(at), by_stage)
-    total += np.einsum("knp,knf->pf", splines.at(t), own)
-    first = adjoint.system.start_by_command(solution.q[0], joints)
+    total = np.tensordot(splines.at(at), by_stage, ((0, 1), (0, 1)))
+    total += np.tensordot(splines.at(t), own, ((0, 1), (0, 1)))
     return total + np.outer(splines.at(np.zeros(1))[0, 0], by_start @ first)
 
 
@@ -553,7 +563,7 @@ def feed_forward_of(
         radau.integrate, tolerance=options.tolerance, stages=options.stages, profile=profile
     )
     first = at_rest(machine, options.tolerance, options.stages)
-    before, last, guess = tip_error_at_rest(machine, first), np.inf, start
+    before, last, guess = 0.0, np.inf, start
     while True:
         splines = Splines(graded_knots(machine.breakpoints, spacing))
         none = np.zeros((splines.count, len(joints)))
@@ -561,6 +571,8 @@ def feed_forward_of(
         for number in range(1 + GAUSS_NEWTON_STEPS):
             if number < GAUSS_NEWTON_STEPS:
                 squares = least_squares(moved, solution, corrections, redundant)
+                gap = squares.gap.reshape(len(squares.t), -1)
+                before = before or float(lengths(gap).max())  # that of the first, at rest
             else:  # what is left is answered by the same derivatives
                 squares = replace(squares, gap=off_path(moved, solution, squares.t).ravel())
             corrections = replace(corrections, coefficients=squares.step(corrections.coefficients))
@@ -574,14 +586,6 @@ def feed_forward_of(
     return FeedForward(
         machine, moved, solution, corrections, redundant, curved, regularity, before, left
     )
-
-
-def tip_error_at_rest(machine: MachineSystem, solution: Solution) -> float:
-    """Return the largest distance of the tip from its path without corrections, m, linearised."""
-    t = solution.time_grid
-    nothing = Corrections(np.zeros(0, dtype=int), Splines(t), np.zeros((len(t), 0)))
-    answer = tip_response(machine, solution, nothing, t)
-    return float(lengths(off_path(machine, solution, t) + answer.forced).max())
 
 
 def joints_of(
