@@ -113,8 +113,7 @@ def part(
     given = {
         "tool_radius": tool_radius,
         "tolerance": tolerance,
-        "optimize": optimize,
-        "iterations": iterations,
+        "optimize": (iterations or True) if optimize else optimize,
         "starts": starts,
     }
     asked = scene.part.unchecked_copy({k: v for k, v in given.items() if v is not None})

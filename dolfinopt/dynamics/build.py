@@ -402,7 +402,8 @@ def simulate(
         if own and feed_forward is not None and scene.control is None:
             problem, solution = feed_forward.machine, feed_forward.solution
         else:
-            solution = radau.integrate(problem, options.tolerance, options.stages, profile, start)
+            stages = radau.stages_for(options.tolerance)
+            solution = radau.integrate(problem, options.tolerance, stages, profile, start)
     profile.counts.simulations += 1
     t = response_instants(
         solution,

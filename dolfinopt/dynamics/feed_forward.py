@@ -549,7 +549,7 @@ def feed_forward_of(
         machine: without corrections.
         asked: joints and spacing, or None for either.
         path: its beginning and end, s.
-        options: tolerance and stages.
+        options: tolerance.
         profile: counts Newton iterations.
         start: solution of a nearby design, or None.
 
@@ -559,10 +559,9 @@ def feed_forward_of(
     """
     joints, regularity, redundant = joints_of(machine, asked.joints, path[0])
     spacing = asked.spacing or FIRST_SPACING * (path[1] - path[0])
-    run = partial(
-        radau.integrate, tolerance=options.tolerance, stages=options.stages, profile=profile
-    )
-    first = at_rest(machine, options.tolerance, options.stages)
+    stages = radau.stages_for(options.tolerance)
+    run = partial(radau.integrate, tolerance=options.tolerance, stages=stages, profile=profile)
+    first = at_rest(machine, options.tolerance, stages)
     before, last, guess = 0.0, np.inf, start
     while True:
         splines = Splines(graded_knots(machine.breakpoints, spacing))

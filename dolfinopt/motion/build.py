@@ -294,7 +294,7 @@ def target_of(t: np.ndarray, scene: Scene) -> Target:
 def _constants(scene: Scene) -> dict[str, float]:
     """Return coordinates that stay where they are: a fixed base, m, lengths of springs, m."""
     result = {rod.name: rod.length or 0.0 for rod in scene.rods if not rod.driven}
-    if not scene.is_spatial and scene.motion.base == "fixed":
+    if not scene.is_spatial and scene.motion.is_fixed:
         result[CART] = scene.motion.base_position
     return result
 
@@ -304,10 +304,10 @@ def _constants(scene: Scene) -> dict[str, float]:
 
 def _chain(scene: Scene) -> Chain:
     """Return the scene's chain in the plane."""
-    motion, fixed = scene.motion, scene.motion.base == "fixed"
+    motion, fixed = scene.motion, scene.motion.is_fixed
     return Chain(
         lengths=tuple(arm.length for arm in scene.arms),
-        shoulder=(motion.base_position if fixed else 0.0, motion.joint_height),
+        shoulder=(motion.base_position, motion.joint_height),
         follow=0.0 if fixed else motion.cart_follow,
         elbow=motion.elbow,
         source=scene.source,
@@ -332,7 +332,7 @@ def _keys(scene: Scene) -> str:
     }.get(motion.path, "the table motion.file")
     if follows(scene):
         return keys
-    shoulder = "base_position" if motion.base == "fixed" else "cart_follow"
+    shoulder = "base" if motion.is_fixed else "cart_follow"
     return f"{keys}, motion.{shoulder}, motion.joint_height or the arms' length"
 
 
@@ -363,7 +363,7 @@ def follower(scene: Scene) -> Follower:
     if stated is not None:
         guess[joints : joints + len(stated)] = stated
     elif scene.closures and not scene.is_spatial:
-        side = scene.closures[0].side
+        side = scene.motion.elbow
     return Follower(
         Task(
             constraints=constraints,

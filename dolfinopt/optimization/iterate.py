@@ -56,7 +56,7 @@ class Iterate:
         self.best, self.progress = Best.none(x), Progress()
         self.iteration, self.change, self.reach, self.returned_to = 0, 0.0, 1.0, -1
         self.residual, self.stuck = Residual(np.nan, np.empty(0)), ""
-        self.curved = bool(self.scene.constraints.limits.keys() - {"mass"})
+        self.curved = bool(self.scene.limits.keys() - {"mass"})
 
     @property
     def nominal(self) -> EvaluatedDesign:

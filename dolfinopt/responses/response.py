@@ -250,7 +250,7 @@ def objective_of(scene: Scene) -> Response:
 def constraints_of(scene: Scene) -> list[Constraint]:
     """Return what the scene limits: the volume, then [constraints] in the order of its keys."""
     volume = scene.design.volume_fraction if scene.designed else None
-    limits = ({} if volume is None else {"volume_fraction": volume}) | scene.constraints.limits
+    limits = ({} if volume is None else {"volume_fraction": volume}) | scene.limits
     result = []
     for key, limit in limits.items():
         response = find_limited(key)(scene.objective, limited=True)

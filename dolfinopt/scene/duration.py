@@ -35,7 +35,9 @@ known_law = lru_cache(maxsize=64)(law_for)
 
 
 def limits_of(motion: Motion) -> Limits:
-    """Return the scene's limits along the path."""
+    """Return the limits along the path that shape the law: of one with variables none."""
+    if motion.coefficients:
+        return Limits()
     values = (motion.max_speed, motion.max_acceleration, motion.max_jerk)
     return Limits(*(np.inf if value is None else value for value in values))
 

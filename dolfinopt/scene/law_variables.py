@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from dolfinopt.scene.duration import least_duration
 from dolfinopt.scene.schema import Scene
 from dolfinopt.scene.tables.motion import SHAPE_LIMIT
 
 LAW = -1  # in place of an arm's index: the law's variables
 DURATION_RANGE = 0.25, 2.0  # shares of the stated one
+MARGIN = 1e-4  # by which it stays above the limits', for differences by the duration
 
 
 def law_names(scene: Scene) -> tuple[str, ...]:
@@ -29,6 +31,7 @@ def law_values(scene: Scene) -> np.ndarray:
 def law_bounds(scene: Scene) -> np.ndarray:
     """Return the least and the largest values (2, n) for a scene as it is stated."""
     low, high = scene.motion.duration * np.array(DURATION_RANGE)
+    low = max(low, (1.0 + MARGIN) * (least_duration(scene.motion)[0] or 0.0))
     count, n = len(scene.motion.coefficients), len(law_names(scene))
     return np.array([[*[-SHAPE_LIMIT] * count, low][:n], [*[SHAPE_LIMIT] * count, high][:n]])
 

@@ -563,10 +563,12 @@ SHOULDER, ARC = -0.25, 0.5  # place of the shoulder and radius of the arc over t
 
 
 def _measure_path(tree: dict[str, Any]) -> Keys:
-    """Complete the lengths of path and filter from the arms'; return their (table, key)."""
+    """Complete lengths of path and filter, and the way of a loop; return their (table, key)."""
     lengths, heights = (_sizes(rows(tree, "arms"), key) for key in ("length", "height"))
     motion, design = tree.get("motion"), tree.setdefault("design", {})
     result: dict[tuple[str, str], float] = {}
+    if motion and tree.get("closures") and not tree.get("joints"):
+        result["motion", "elbow"] = 1
     if motion and lengths and not tree.get("joints"):
         result["motion", "joint_height"] = SHOULDER * sum(lengths)
         if motion.get("path") == "arc":

@@ -101,6 +101,28 @@ def _bore(name: str) -> Callable[[Tree, Row, Any], None]:
     return translate
 
 
+def _fixed_at(tree: Tree, row: Row, value: Any) -> None:
+    if row.get("base") == "fixed":
+        row["base"] = value
+
+
+def _steps(tree: Tree, row: Row, value: Any) -> None:
+    if row.get("optimize") is True:
+        row["optimize"] = value
+
+
+def _of_motion(key: str) -> Callable[[Tree, Row, Any], None]:
+    def translate(tree: Tree, row: Row, value: Any) -> None:
+        tree.setdefault("motion", {})[key] = value
+
+    return translate
+
+
+def _way(tree: Tree, row: Row, value: Any) -> None:
+    if not tree.get("joints"):
+        tree.setdefault("motion", {})["elbow"] = value
+
+
 def _exact(tree: Tree, row: Row, value: Any) -> None:
     if value:
         tree.setdefault("objective", {})
@@ -130,6 +152,15 @@ OLD_WORDS = (
     OldWord("control.damping_factor", "control.damping times it", _scaled("damping"), 1.0),
     OldWord("optimizer.exact_iterations", 'objective.gradient = "exact"', _exact, 0),
     OldWord("simulation.integrator", "every motion is integrated by Radau IIA", None, "radau"),
+    OldWord("closures.side", "motion.elbow", _way),
+    OldWord("motion.base_position", "motion.base = the number", _fixed_at, 0.0),
+    OldWord("constraints.path_speed", "motion.max_speed", _of_motion("max_speed")),
+    OldWord(
+        "constraints.path_acceleration", "motion.max_acceleration", _of_motion("max_acceleration")
+    ),
+    OldWord("constraints.path_jerk", "motion.max_jerk", _of_motion("max_jerk")),
+    OldWord("part.iterations", "part.optimize = the number", _steps, 80),
+    OldWord("simulation.stages", "steps have four stages", None, 4),
     OldWord("part.curves", "parts have lines, arcs and circles", None, "splines"),
     OldWord("part.simplify", "parts have lines, arcs and circles", None, False),
     OldWord("simulation.rho_inf", "every motion is integrated by Radau IIA", None, 0.8),

@@ -27,8 +27,8 @@ from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
 from dolfinopt.scene.tables.joints import place_of
 from dolfinopt.scene.tables.machine import Control, Damping, Force, Joint, Payload
 from dolfinopt.scene.tables.material import Material, material_keys
-from dolfinopt.scene.tables.motion import Motion, Reduction, Simulation
-from dolfinopt.scene.tables.objective import Constraints, Objective, Scenario
+from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction, Simulation
+from dolfinopt.scene.tables.objective import Constraints, Limit, Objective, Scenario
 
 
 def check_scene_name(name: str) -> str:
@@ -195,6 +195,13 @@ class Scene(Table):
         return min([1.0, *scales])
 
     @property
+    def limits(self) -> dict[str, Limit]:
+        """What is limited: [constraints], and the rates along the path of a law with variables."""
+        rates = {f"path_{key[4:]}": getattr(self.motion, key) for key in LIMITS}
+        stated = {key: limit for key, limit in rates.items() if limit is not None}
+        return self.constraints.limits | (stated if self.motion.coefficients else {})
+
+    @property
     def is_spatial(self) -> bool:
         """Whether the machine moves in space, by [[joints]]."""
         return bool(self.joints)
@@ -264,7 +271,7 @@ class Scene(Table):
             joints = tuple(joint.name for joint in self.movable if not joint.passive)
             return joints + tuple(closure.name for closure in self.closures if closure.driven)
         names = tuple(arm.name for arm in self.arms[: len(self.arms) - self.dependent_joints])
-        return names if self.motion.base == "fixed" else ("cart", *names)
+        return names if self.motion.is_fixed else ("cart", *names)
 
     @property
     def rods(self) -> tuple[Closures, ...]:
@@ -309,7 +316,7 @@ class Scene(Table):
         if self.closures:
             names = list(self.rigid_units)
             return [names.index(name) for name in self.driven]
-        first = 1 if self.motion.base == "fixed" and not self.is_spatial else 0
+        first = 1 if self.motion.is_fixed and not self.is_spatial else 0
         return slice(first, first + len(self.driven))
 
     def material_of(self, index: int) -> Material:

@@ -40,7 +40,7 @@ SHAPERS: dict[ShaperKind, str] = {
     "ei": "input shaper EI",
 }
 # Keys of [motion] that a table of joints keeps.
-KEPT = ("base", "base_position", "cart_mass", "joint_height", "gravity", "initial_joints")
+KEPT = ("base", "cart_mass", "joint_height", "gravity", "initial_joints")
 ROWS = 2000  # of a table of shaped joints
 TEN_PERCENT, FIVE_PERCENT = 1.1, 0.95
 

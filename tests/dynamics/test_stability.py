@@ -330,7 +330,7 @@ def test_vibrations_of_megahertz() -> None:
 def test_undamped_energy_does_not_drift() -> None:
     """13 s after the motion the arms still vibrate with the energy they were left with."""
     undamped = "damping.stiffness_proportional=0.0"
-    trajectory = moved(undamped, "motion.horizon=15.0", "simulation.stages=5")
+    trajectory = moved(undamped, "motion.horizon=15.0")
     kinetic, strain, _ = energies(trajectory, np.linspace(2.0, 15.0, 27))
     left = kinetic + strain
     # The error is relative to the largest deflection, that of the motion itself: 30 times those
@@ -473,7 +473,7 @@ def drawn(rng: np.random.Generator, folder: Path) -> dict:
         "damping": {"stiffness_proportional": one(0.0, 2e-4, 1e-2)},
         "reduction": {"method": one(*METHODS), "coordinates": int(rng.integers(3, 9))},
         "objective": {"kind": one(*KINDS), "load_cases": 5, "gradient": one("esl", "exact")},
-        "simulation": {"tolerance": one(1e-3, 1e-5), "stages": int(rng.integers(2, 6))},
+        "simulation": {"tolerance": one(1e-3, 1e-5)},
         "design": {"filter_radius": one(0.0, 0.03)},
     }
 

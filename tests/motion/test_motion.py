@@ -144,7 +144,7 @@ PATHS = {
     "joints": {"path": "joints"},
     "joints in time": {"path": "joints", "law": "quintic"},
 }
-BASES = {"cart": {}, "fixed": {"base": "fixed", "base_position": 0.1}}
+BASES = {"cart": {}, "fixed": {"base": 0.1}}
 MOTIONS = [
     (arms, path, law, base)
     for arms in (1, 2, 3, 4)
@@ -271,7 +271,7 @@ UNREACHABLE = [  # arms, motion, worst instant and distance there, what it is, k
      "more than 0 m", "motion.flattening"),
     ((0.5, 0.5, 0.5), {"cart_follow": 0.0, "radius": 1.0, "joint_height": -0.5}, 0.95, 1.5,
      "elbows bent alike", "the arms' length"),
-    ((1.0, 0.2, 0.2), LINE, 0.95, 0.6, "from the shoulder", "motion.base_position"),
+    ((1.0, 0.2, 0.2), LINE, 0.95, 0.6, "from the shoulder", "motion.base"),
     ((1.2,), {"radius": 1.0, "joint_height": -0.5}, 0.95, 1.5, "above the shoulder; arms of 1.2 m",
      "motion.flattening"),
     ((1.2,), LINE | {"base": "cart", "end": [1, -2]}, 1.9, -1.5, "above the", "motion.end"),

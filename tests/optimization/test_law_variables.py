@@ -109,7 +109,8 @@ def test_run_is_resumed_in_the_same_bits_and_its_design_read_with_its_law(tmp_pa
     [
         (["feed_forward.kind=tip"], "feed_forward.kind"),
         (["objective.gradient=esl"], "objective.gradient"),
-        (["motion.max_speed=30"], "constraints.path_speed"),
+        (["motion.shape=0", "objective.kind=duration", "motion.law=s-curve", "motion.max_speed=30",
+          "motion.duration=1.9"], "motion.shape"),
         ([f"motion.shape={[0.01] * 9}"], "at most 8 coefficients"),
     ],
 )
@@ -120,10 +121,10 @@ def test_what_a_designed_law_cannot_be_combined_with(changes: list[str], words: 
 
 def test_rates_along_the_path() -> None:
     """Of the quintic law in closed form; their gradients by differences."""
-    limits = "path_speed", "path_acceleration", "path_jerk"
+    limits = "max_speed", "max_acceleration", "max_jerk"
     chain = evaluator_of(
         "objective.kind=duration", "motion.shape=[0.0,0.0]",
-        *(f"constraints.{one}=1" for one in limits),
+        *(f"motion.{one}=1" for one in limits), "motion.duration=1.9",
     )  # fmt: skip
     x, T = chain.variables.initial, chain.scene.motion.duration
     here = chain.evaluate(x)[-1]

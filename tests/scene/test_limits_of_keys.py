@@ -31,7 +31,6 @@ USED = {
     "payload.inertia": ["simulation.stiffening=false", "reduction.coordinates=3"],
     "motion.horizon": ["motion.duration=1e5", "simulation.sample=1e3"],
     "motion.gravity": ["motion.duration=2", "motion.horizon=2"],
-    "motion.base_position": ["motion.base=fixed"],
     "design.sharpness": ["design.projection=heaviside", DENSE],
     "design.continuation": ["design.projection=heaviside", DENSE],
     "design.erosion": ["design.projection=robust", DENSE],

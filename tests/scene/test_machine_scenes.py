@@ -96,7 +96,7 @@ def test_two_arms_that_cannot_be(make, told):
                     "control": {"stiffness": [2e3], "damping": [20.0]}}, ["1 number, for crank"]),
         ("slider", {"closure": {"kind": "pin"}}, ['closure.kind = "pin"', "at least 3 arms"]),
         ("slider", {"closure": {"direction": [0.0, 0.0]}}, ["closure.direction", "length zero"]),
-        ("slider", {"closure": {"side": 0}}, ["closure.side = 0", "-1 | 1"]),
+        ("slider", {"closure": {"side": 0}}, ["motion.elbow = 0", "-1 | 1"]),
         ("pin", {"closure": {"force": 3.0}}, ["closure.force = 3.0", "0.0, the default, with"]),
         ("pin", {"closure": {"direction": [0.0, 1.0]}}, ["closure.direction", "the default, with"]),
         ("slider", {"motion": {"path": "arc"}}, ["motion.", "expected"]),
@@ -286,16 +286,16 @@ def test_the_plane_has_closures_that_are_its_closure():
     for key in ("axis", "direction"):
         found = scene_from_dict(in_plane("slider", **{key: [2.0, 0.0]}))
         assert found == loop("slider", closure=named | {"direction": [2.0, 0.0]})
-    assert scene_from_dict(in_plane("pin", point=[0.25, 0.0], side=-1)) == loop(
-        "pin", closure=named
-    )
+    pin = in_plane("pin", point=[0.25, 0.0])
+    pin["motion"] |= {"elbow": -1}
+    assert scene_from_dict(pin) == loop("pin", closure=named)
     # A third number says nothing new.
     for kind, flat, keys in (
         ("slider", {"axis": [2.0, 0.0]}, {"axis": [2.0, 0.0, 0.0]}),
         ("pin", {"point": [0.25, 0.0]}, {"point": [0.25, 0.0, 0.0], "axis": [0.0, 0.0, 1.0]}),
     ):
         (one,), (other,) = (
-            loops_of(scene_from_dict(in_plane(kind, side=-1, **given))).ties
+            loops_of(scene_from_dict(in_plane(kind, **given))).ties
             for given in (flat, keys)
         )
         np.testing.assert_array_equal(one.point, other.point)
@@ -313,7 +313,7 @@ def test_the_plane_has_closures_that_are_its_closure():
 
 def test_both_spellings_of_a_loaded_slider_are_the_same():
     """The same scene and the same bits; changes are understood in both spellings."""
-    line = {"point": [0.0, 0.01], "side": 1}
+    line = {"point": [0.0, 0.01]}
     was = loop_tree(closure=line | {"direction": [1.0, 0.1], "force": -200.0})
     size = np.hypot(1.0, 0.1)
     now = in_plane("slider", axis=[1.0, 0.1], name="closure", **line)
@@ -327,7 +327,7 @@ def test_both_spellings_of_a_loaded_slider_are_the_same():
     np.testing.assert_array_equal(a.closure_force, b.closure_force)
     for was, now in (
         ("closure.force=7", "forces.closure.factor=7.0"),
-        ("closure.side=-1", "closures.closure.side=-1"),
+        ("closure.side=-1", "motion.elbow=-1"),
         ("closure.point=[0.0, 0.02]", "closures.0.point=[0.0, 0.02]"),
     ):
         assert scene_from_dict(old.to_tree(), overrides=[was]) == scene_from_dict(
@@ -340,8 +340,8 @@ def test_both_spellings_of_a_loaded_slider_are_the_same():
 @pytest.mark.parametrize(
     ("tree", "changes", "words"),
     [
-        (loop_tree(), ["closure.side=0"], ("--set closure.side=0", "closure.side = 0", "-1 | 1")),
-        (loop_tree(), ["closure.sides=1"], ("unknown key closure.sides", "closures.0.side?")),
+        (loop_tree(), ["closure.side=0"], ("motion.elbow = 0", "-1 | 1")),
+        (loop_tree(), ["closure.sides=1"], ("unknown key closure.sides", "name, kind")),
         (loop_tree(), ["closure.force=1e13"], ("closure.force", "a number", "<= 1e+12")),
         (loop_tree(), ["closure.force=much"], ('closure.force = "much"', "a number")),
         (loop_tree(), ["closure=3"], ("closure:", "[[closures]]")),
@@ -352,7 +352,6 @@ def test_both_spellings_of_a_loaded_slider_are_the_same():
             [],
             ("closure:", "[[closures]]"),
         ),
-        (in_plane("slider", axis=[1, 0]), ["closures.end.side=0"], ("closures.0.side (end) = 0",)),
     ],
 )
 def test_keys_of_the_closure_are_told_as_they_are_written(tree, changes, words):
@@ -368,7 +367,6 @@ REFUSED = [
     ((*CLOSURE, "cross_axis"), [1, 0, 0], ("closures.0.cross_axis", "with kind")),
     ((*CLOSURE, "length"), 0.2, ("closures.0.length", "none", "with kind")),
     ((*CLOSURE, "stiffness"), 1e5, ("closures.0.stiffness", "with kind")),
-    ((*CLOSURE, "side"), -1, ("closures.0.side", "motion.initial_joints")),
     ((*CLOSURE, "name"), "knee", ("closures.0.name", "no joint or other closure")),
     ((*CLOSURE, "name"), "t", ("closures.0.name", "the time")),
     ((*CLOSURE, "between"), ["rocker.tip", "ground"], ("closures.0.between", '"rocker.outboard"')),

@@ -99,12 +99,6 @@ class Closures(Table):
         "of a rod; default: it is driven, its length a column of the motion's table, "
         "or what the path asks for [m]",
     )
-    side: Literal[-1, 1] = setting(
-        1,
-        "in the plane: which way the loop is assembled: sign of the last joint's angle "
-        "at the start; where that is zero, the stretched way; instead, and in space, "
-        "motion.initial_joints says it [-]",
-    )
     stiffness: float = setting(
         0.0, "of a rod that is a spring; 0: it is rigid [N/m]", ge=0, le=1e15
     )
@@ -164,14 +158,7 @@ class Closures(Table):
             self._check_in_plane(scene)
 
     def _check_in_space(self, scene: Scene) -> None:
-        """Refuse what is of the plane, and what a loop in space cannot be combined with."""
-        if self.side != 1:
-            raise Refusal(
-                "expected 1, the default, with [[joints]]: motion.initial_joints says which way "
-                "the loop is assembled",
-                ".side",
-                "joints",
-            )
+        """Refuse what a loop in space cannot be combined with."""
         if self.kind == "pin" and self.axis is None:
             raise Refusal("expected an array of three numbers with a pin", ".axis")
         for key in ("point", "axis"):
@@ -222,7 +209,7 @@ class Closures(Table):
                 ".kind",
                 "arms",
             )
-        if scene.motion.base != "fixed":
+        if not scene.motion.is_fixed:
             raise Refusal('expected "fixed" with [[closures]]', "motion.base", ".kind")
         if scene.motion.path not in ("rotation", "joints"):
             raise Refusal(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from dolfinopt.scene.tables.base import (
     MAX_ITERATIONS,
@@ -461,6 +461,10 @@ class Optimizer(Table):
 MAX_STARTS = 100
 
 
+STEPS = 80  # of the curves, unless stated
+OptimizerSteps = Annotated[int, Field(ge=1, le=MAX_ITERATIONS)]
+
+
 class Part(Table):
     """Parts for the workshop."""
 
@@ -473,11 +477,10 @@ class Part(Table):
     minimum_member: Length | None = setting(
         None, "smallest width of members of a part; default: design.minimum_member, or 0.001 [m]"
     )
-    optimize: bool = setting(
-        False, "optimise the parts' free curves, too: the scene's objective within its limits [-]"
-    )
-    iterations: int = setting(
-        80, "largest number of steps of the curves from every start [-]", ge=1, le=MAX_ITERATIONS
+    optimize: bool | OptimizerSteps = setting(
+        False,
+        "optimise the parts' free curves, too: the scene's objective within its limits; a number: "
+        "by as many steps from every start at most, true: 80 [-]",
     )
     starts: int = setting(
         0,
@@ -485,3 +488,8 @@ class Part(Table):
         ge=0,
         le=MAX_STARTS,
     )
+
+    @property
+    def iterations(self) -> int:
+        """Largest number of steps of the curves from every start."""
+        return STEPS if isinstance(self.optimize, bool) else self.optimize

@@ -53,7 +53,7 @@ OF_MOVING = ("axis", "passive", "position_limits", "velocity_limit", "effort_lim
 GROUND = "ground"
 PATHS = ("joints", "points", "line")  # of machines in space
 # What a machine in the plane has instead of joints.
-PLANE_KEYS = ("base", "base_position", "cart_follow", "cart_mass", "joint_height", "elbow")
+PLANE_KEYS = ("base", "cart_follow", "cart_mass", "joint_height", "elbow")
 
 
 def check_joint_name(name: str) -> str:

@@ -18,6 +18,7 @@ from dolfinopt.scene.tables.base import (
     Table,
     Use,
     setting,
+    shown,
 )
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ JointValue = Annotated[float, Field(ge=-1e4, le=1e4)]  # rad, m
 Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 PathKind = Literal["arc", "line", "points", "joints", "rotation"]
 TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
-Base = Literal["cart", "fixed"]
+Base = Literal["cart", "fixed"] | Position
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
 Gravity = tuple[Acceleration, Acceleration] | tuple[Acceleration, Acceleration, Acceleration]
 Instant = Annotated[float, Field(ge=0, le=1e5)]  # s
@@ -39,9 +40,7 @@ ShapeCount = Annotated[int, Field(ge=0, le=MOST_COEFFICIENTS)]
 Coefficient = Annotated[float, Field(ge=-SHAPE_LIMIT, le=SHAPE_LIMIT)]
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 LIMITS = ("max_speed", "max_acceleration", "max_jerk")
-
-
-OF_PATH = "path_speed", "path_acceleration", "path_jerk"  # limits of a law with variables
+PROFILES = ("trapezoidal", "s-curve")  # laws that are shaped by the limits
 
 
 class Motion(Table):
@@ -53,9 +52,8 @@ class Motion(Table):
         Use("initial_joints", "path", "line points joints rotation"),
         Use("file table_ends", "path", "points joints"),
         Use("speed start_angle", "path", "rotation"),
-        Use("cart_follow elbow max_speed max_acceleration max_jerk", "path", "arc line points"),
+        Use("cart_follow max_speed max_acceleration max_jerk", "path", "arc line points"),
         Use("cart_follow cart_mass", "base", "cart"),
-        Use("base_position", "base", "fixed"),
         Use("acceleration_share", "law", "trapezoidal s-curve"),
         Use("max_jerk", "law", "quintic septic s-curve"),
     )
@@ -83,7 +81,7 @@ class Motion(Table):
         None,
         "joint coordinates near those at the start of an end-effector's path in "
         "space, or of closed loops, for [[joints]] that move, in the plane for all arms: which "
-        "solution is meant; default: 0, in the plane by closures.side [rad, m]",
+        "solution is meant; default: 0, in the plane by elbow [rad, m]",
     )
     file: FileName | None = setting(
         None,
@@ -117,12 +115,14 @@ class Motion(Table):
         ge=1e-3,
         le=0.5,
     )
-    max_speed: PathLimit | None = setting(None, "limit of the speed along the path [m/s]")
+    max_speed: PathLimit | None = setting(
+        None, "limit of the speed along the path; of a law with variables (shape) a constraint [m/s]"
+    )
     max_acceleration: PathLimit | None = setting(
-        None, "limit of the acceleration along the path [m/s2]"
+        None, "limit of the acceleration along the path, alike [m/s2]"
     )
     max_jerk: PathLimit | None = setting(
-        None, 'limit of the jerk along the path; not with "trapezoidal" [m/s3]'
+        None, 'limit of the jerk along the path, alike; not with "trapezoidal" [m/s3]'
     )
     duration: Duration = setting(
         1.9,
@@ -144,8 +144,10 @@ class Motion(Table):
         "further rest intervals for settling: true, every stop of the path; false, "
         "none; or a list of [start, end] [s]",
     )
-    base: Base = setting("cart", "what carries the shoulder joint [-]")
-    base_position: Position = setting(0.0, "x of the shoulder joint on a fixed base [m]")
+    base: Base = setting(
+        "cart",
+        'what carries the shoulder joint: "cart"; "fixed", at x = 0; or the x of a fixed base [m]',
+    )
     cart_follow: float = setting(
         0.5,
         "cart's position over the end-effector's desired x; not with one arm, a "
@@ -158,7 +160,10 @@ class Motion(Table):
         -0.5, "y of the shoulder joint; default: a quarter of the length of all arms below 0 [m]"
     )
     elbow: Literal[-1, 1] = setting(
-        -1, "sign of the elbow angle beta; with one arm, of the cosine of its angle [-]"
+        -1,
+        "which of two ways: sign of the elbow angle beta, with one arm of the cosine of its angle; "
+        "of a closed loop in the plane that of the last joint's angle at the start, where that is "
+        "zero the stretched way, unless initial_joints says it; default of a loop: 1 [-]",
     )
     gravity: Gravity = setting(
         (0.0, 0.0),
@@ -176,14 +181,14 @@ class Motion(Table):
             )
         if self.path == "line" and self.start == self.end:
             raise Refusal("expected another point than motion.start", "end", "start")
-        if self.path == "rotation" and self.base != "fixed":
+        if self.path == "rotation" and not self.is_fixed:
             raise Refusal('expected "fixed" with motion.path = "rotation"', "base", "path")
         self._check_law()
         return self
 
     def _check_law(self) -> None:
         """Raise where the law does not use a limit, or the path ends behind the horizon."""
-        profile = self.law in ("trapezoidal", "s-curve")
+        profile = self.law in PROFILES
         last = "max_jerk" if self.law == "s-curve" else "max_acceleration"
         if profile and getattr(self, last) is not None:
             reason = f"with motion.{last}, which determines how long the law accelerates"
@@ -194,6 +199,16 @@ class Motion(Table):
                 "horizon",
                 "duration",
             )
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the shoulder stands still."""
+        return self.base != "cart"
+
+    @property
+    def base_position(self) -> float:
+        """x of the shoulder on a fixed base, m."""
+        return self.base if isinstance(self.base, float) else 0.0
 
     @property
     def coefficients(self) -> tuple[float, ...]:
@@ -255,17 +270,16 @@ class Motion(Table):
             )
         if self.coefficients or scene.objective.kind == "duration":
             self._check_designed_law(scene)
-        else:
-            for key in OF_PATH:
-                if key in scene.constraints.limits:
-                    raise Refusal(
-                        "expected none without variables of the law (motion.shape): limit a given "
-                        f"law by motion.max_{key[5:]}",
-                        f"constraints.{key}",
-                    )
         self._check_limits()
         if scene.is_spatial:
             return  # `tables.joints` knows
+        if self.path in ("joints", "rotation") and not scene.closures and self.elbow != -1:
+            raise Refusal(
+                f"expected -1, the default, with path = {shown(self.path)}: no path is followed, "
+                "and without [[closures]] no loop is put together",
+                "motion.elbow",
+                "motion.path",
+            )
         for key in ("gravity", "start", "end"):
             if len(getattr(self, key)) == 3:
                 raise Refusal(
@@ -293,7 +307,7 @@ class Motion(Table):
             )
         if len(scene.arms) > 1 or self.path in ("joints", "rotation"):
             return
-        if self.base == "fixed":
+        if self.is_fixed:
             raise Refusal(
                 f'expected "cart" with one arm and motion.path = "{self.path}": a single joint '
                 'follows no path; prescribe its angle with motion.path = "joints"',
@@ -312,7 +326,7 @@ class Motion(Table):
         key = ("motion", "shape") if self.coefficients else ("objective", "kind")
         if len(self.coefficients) > MOST_COEFFICIENTS:
             raise Refusal(f"expected at most {MOST_COEFFICIENTS} coefficients", "motion.shape")
-        rates = any(item in scene.constraints.limits for item in OF_PATH)
+        rates = any(getattr(self, limit) is not None for limit in LIMITS)
         if self.path in ("points", "joints") or (rates and self.path == "rotation"):
             raise Refusal(
                 'expected "arc" or "line", or "rotation" without limits along the path: the '
@@ -320,13 +334,12 @@ class Motion(Table):
                 "motion.path",
                 key,
             )
-        for limit in OF_PATH:
-            if getattr(self, f"max_{limit[5:]}") is not None:
-                raise Refusal(
-                    f"expected none: limit a law with variables by constraints.{limit}",
-                    ("motion", f"max_{limit[5:]}"),
-                    key,
-                )
+        if rates and not self.coefficients and self.law in PROFILES:
+            raise Refusal(
+                "expected 1 at least with limits along the path, which shape this law by themselves",
+                "motion.shape",
+                key,
+            )
         if scene.feed_forward.on:
             raise Refusal(
                 'expected "none": corrections of joints do not follow a law with variables',
@@ -359,7 +372,6 @@ class Simulation(Table):
     tolerance: float = setting(
         1e-4, "relative error allowed in the elastic coordinates [-]", ge=1e-12, le=0.1
     )
-    stages: int = setting(4, "stages of the Radau IIA method [-]", ge=2, le=5)
     stiffening: bool | Literal["auto"] = setting(
         "auto",
         "geometric stiffening by the arms' own stress: true, false, or where the "

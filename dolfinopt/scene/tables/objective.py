@@ -196,7 +196,7 @@ class Objective(Table):
         """Return what asks for the exact gradient of a motion, and its key; "" if nothing does."""
         if self.response.exact:
             return f'objective.kind = "{self.kind}"', ("objective", "kind")
-        for key in scene.constraints.limits:
+        for key in scene.limits:
             if limited_by(key).exact:
                 return f"constraints.{key}", ("constraints", key)
         exact = 'objective.gradient = "exact"' if self.gradient == "exact" else ""
@@ -205,7 +205,7 @@ class Objective(Table):
     def _check_unused(self, scene: Scene) -> None:
         """Refuse options that neither the objective nor a limit uses."""
         fields = type(self).model_fields
-        for key in unused_options(fields, self.kind, scene.constraints.limits):
+        for key in unused_options(fields, self.kind, scene.limits):
             default = fields[key].default
             if getattr(self, key) == default:
                 continue
@@ -261,7 +261,7 @@ class Objective(Table):
 
     def _check_lightest(self, scene: Scene) -> None:
         """Refuse what the removal of all material makes least, unless something keeps it."""
-        limited = not all(limited_by(key).lighter for key in scene.constraints.limits)
+        limited = not all(limited_by(key).lighter for key in scene.limits)
         if self.response.lighter and self.direction != "maximize" and not limited:
             least = "the lightest design is an empty one"
             if self.kind != "mass":
@@ -422,7 +422,7 @@ class Constraints(ConstraintOptions):
 
 def _add_key(one: Declaration) -> None:
     """Add the key that limits a response to `Constraints`, which is to be rebuilt."""
-    if one.limit:
+    if one.limit and one.limit.stated:
         field = FieldInfo(
             default=None, description=one.limit.help, annotation=one.limit.type | None
         )

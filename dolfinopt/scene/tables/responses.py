@@ -105,6 +105,7 @@ class Limited:
         unit: of the true values and the limit; "" where it is the objective's.
         lower: whether it is a lower limit.
         options: keys of [objective] or [constraints] that it uses; None: the response's.
+        stated: whether it is a key under [constraints]; else [motion] has the limit.
     """
 
     help: str
@@ -113,6 +114,7 @@ class Limited:
     unit: str = ""
     lower: bool = False
     options: tuple[str, ...] | None = None
+    stated: bool = True
 
 
 @dataclass(frozen=True)
@@ -354,11 +356,7 @@ DECLARED: dict[str, Declaration] = {
                 f"largest {what} along the path",
                 unit,
                 frozenset(),
-                Limited(
-                    f"upper limit of the {what} along the path of a law with variables, see "
-                    f"motion.shape [{unit}]",
-                    Rate,
-                ),
+                Limited("", Rate, stated=False),
                 objective=False,
                 exact=True,
                 of_nominal=True,
@@ -429,8 +427,8 @@ def limited_by(key: str) -> Declaration:
 
 
 def asked(scene: Scene) -> list[Declaration]:
-    """Return the objective and everything under [constraints]."""
-    return [DECLARED[scene.objective.kind], *map(limited_by, scene.constraints.limits)]
+    """Return the objective and everything that is limited."""
+    return [DECLARED[scene.objective.kind], *map(limited_by, scene.limits)]
 
 
 def need_of(scene: Scene, what: Need) -> list[Declaration]:
