@@ -108,7 +108,7 @@ def simulate_parts(
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for arm, owner in zip(scene.arms, scene.owners, strict=True):
-            if owner is not None and not arm.design:
+            if owner is not None and not arm.shares:
                 meshes[owner].write(folder / f"{arm.name}.msh")
         data = scene_data(scene, parts, folder)
         for table, keys in changes.items():

@@ -190,7 +190,8 @@ def scene_data(scene: Scene, parts: Mapping[int, Part], meshes: Path) -> dict[st
     data["name"] = f"{scene.name}: part"
     for row, arm, owner in zip(data["arms"], scene.arms, scene.owners, strict=True):
         if owner is not None:
-            name = scene.arms[owner].name if arm.design else arm.name
+            name = scene.arms[owner].name if arm.shares else arm.name
+            row["design"] = arm.design if arm.shares else None
             row.update(_meshed(meshes.absolute() / f"{name}.msh") | parts[owner].keys())
             row["interfaces"] = [
                 {"name": interface.name, "point": list(point)}
@@ -212,7 +213,6 @@ def _meshed(mesh: Path) -> dict[str, Any]:
         "cell_shape": None,
         "cells": None,
         "passive": None,
-        "pattern": None,
         "regions": None,
         "symmetric": False,  # which its mesh is not to the last cell
         "mesh_scale": 1.0,

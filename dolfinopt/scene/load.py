@@ -40,6 +40,7 @@ from dolfinopt.scene.messages import (
 from dolfinopt.scene.old_words import OLD_KEYS, read_old_words, rows, scaled
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name, named_files
 from dolfinopt.scene.tables.arms import (
+    JOINT_KEYS,
     MAX_ARMS,
     MAX_CELLS,
     MESH_KEYS,
@@ -169,6 +170,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
     inherited |= _inherit(tree, [key for key in required if key not in OWN_KEYS])
     _size_rigid(tree)
+    _drop_scaled(tree, inherited)
     _share_interfaces(tree)
     _fill_material(tree, source, changes)
     _resolve_files(tree, source, changes)
@@ -268,6 +270,18 @@ def _measure_bodies(tree: dict[str, Any], inherited: set[Loc]) -> None:
         for loc in [loc for loc in inherited if loc[:2] == ("arms", i)]:
             if loc[2] in (*PATTERN_KEYS, *MESH_KEYS):
                 arm.pop(loc[2], None)
+
+
+def _drop_scaled(tree: dict[str, Any], inherited: set[Loc]) -> None:
+    """Take out of arms with another's design, scaled, what they took over and have from there."""
+    arms = rows(tree, "arms")
+    for i, arm in enumerate(arms):
+        for owner in [other for other in arms[:i] if other.get("name") == arm.get("design", "")]:
+            keys = (*OWN_KEYS, *JOINT_KEYS)
+            both = [{k: x for k, x in row.items() if k not in keys} for row in (arm, owner)]
+            for key in PATTERN_KEYS if both[0] != both[1] else ():
+                if ("arms", i, key) in inherited:
+                    arm.pop(key, None)
 
 
 def _share_interfaces(tree: dict[str, Any]) -> None:
@@ -415,8 +429,6 @@ def _replaced(arm: Mapping[str, Any]) -> Iterator[Sequence[str]]:
         yield material_keys()
     if "kind" in arm:
         yield ["material", *material_keys()]
-    if "pattern" in arm:
-        yield PATTERN_KEYS
     if arm.get("rigid") is True or "sid" in arm:
         yield ("regions",)
     if arm.get("hollow") is False:

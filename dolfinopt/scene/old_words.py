@@ -136,6 +136,7 @@ OLD_WORDS = (
     OldWord(
         "arms.symmetric_z", 'arms.symmetric = "z", "yz" about both planes', _symmetric_z, False
     ),
+    OldWord("arms.pattern", "arms.design", _renamed("design")),
     OldWord("arms.hull", "arms.hollow = its file", _renamed("hollow")),
     OldWord("arms.section", "arms.hollow = the section", _renamed("hollow")),
     OldWord("arms.inboard_bore", 'an entry "inboard" of [[arms.interfaces]]', _bore(INBOARD)),

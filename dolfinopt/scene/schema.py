@@ -114,7 +114,7 @@ class Scene(Table):
         """For every arm the index of the arm that has its design; None where there is none."""
         index = {arm.name: i for i, arm in enumerate(self.arms)}
         return tuple(
-            (index[arm.design] if arm.design is not None else i) if arm.flexible else None
+            (index[str(arm.design)] if arm.shares else i) if arm.flexible else None
             for i, arm in enumerate(self.arms)
         )
 
@@ -364,7 +364,10 @@ class Scene(Table):
         # Not by min_length: pydantic would also count arms that are there but invalid as absent.
         if not arms:
             raise ValueError
-        return arms
+        result: dict[str | None, Arm] = {}
+        for arm in arms:  # those of one name are refused later
+            result[arm.name] = arm.like(result.get(arm.design))
+        return tuple(result.values()) if len(result) == len(arms) else arms
 
     @model_validator(mode="after")
     def _check_tables(self) -> Scene:

@@ -152,11 +152,11 @@ class Members:
     def _row(self, index: int, share: float) -> dict[str, Any]:
         """Return the keys of an arm with its section."""
         arm = self.scene.arms[index]
-        none = ("mesh", "element", "mesh_size", "cell_shape", "cells", "passive", "pattern",
+        none = ("mesh", "element", "mesh_size", "cell_shape", "cells", "passive",
                 "interface_offset", *WALL_KEYS)  # fmt: skip
         row: dict[str, Any] = dict.fromkeys(none)
         row |= {"symmetric": False, "extruded": False, "hollow": False, "mesh_scale": 1.0}
-        row |= {"regions": [], "interfaces": []}
+        row |= {"regions": [], "interfaces": [], "design": arm.design if arm.shares else None}
         if self.section.plane is None:
             height, thickness = self.section.measures(arm.height, arm.thickness, share)
             cells = arm.cells or _bar_cells(arm.length, height, thickness, arm.is_solid)

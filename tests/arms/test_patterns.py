@@ -15,7 +15,7 @@ from dolfinopt.parallel import Partition
 
 WORLD = MPI.COMM_WORLD
 SMALL = ("arms.cells=[40,4]", "arms.passive=0.05", "optimizer.max_iterations=4")
-REPEATED = ("arms.arm2.pattern=arm1", "arms.arm2.length=0.8", "arms.arm2.height=0.045")
+REPEATED = ("arms.arm2.design=arm1", "arms.arm2.length=0.8", "arms.arm2.height=0.045")
 SCALED = (*SMALL, *REPEATED, "arms.arm2.thickness=0.012", "arms.arm2.density=2500.0")
 REGIONS = ('arms.arm1.regions=[{kind="void", circle=[0.5, 0.0, 0.016]}, '
            '{kind="solid", box=[0.2, -0.03, 0.3, -0.01]}]')  # fmt: skip
@@ -54,22 +54,6 @@ def test_cells_have_the_densities_of_their_partners(projection):
         known = {k: v for part in WORLD.allgather(mine) for k, v in part.items()}
         assert np.array_equal(known[0], known[1])
         assert 0.0 in known[0] and 1.0 in known[0]  # regions and solid ends, too
-
-
-@pytest.mark.serial  # ranks: test_any_number_of_ranks_ends_in_the_same_design
-def test_the_same_arm_again_is_the_shared_design():
-    """A pattern of the same size ends where `arms.design` does, which has one mesh for both."""
-    histories = []
-    for way in ("design", "pattern"):
-        scene = do.load_scene(TWO_ARM, (*SMALL, f"arms.arm2.{way}=arm1"))
-        result = do.optimize(scene)
-        rows = [(r.objective, r.max_deviation, r.volume_fraction, r.kkt) for r in result.history]
-        histories.append(WORLD.bcast(rows, root=0))
-    assert len(histories[0]) == 5
-    same, ended = np.array(histories[1]), np.array(histories[0])
-    np.testing.assert_allclose(same[:, :3], ended[:, :3], rtol=1e-9)
-    # Rounding decides which variables next to their bounds count among those that can move.
-    np.testing.assert_allclose(same[:, 3], ended[:, 3], rtol=1e-3)
 
 
 LIMITED = "constraints.tip_deflection=1e-4", "constraints.first_frequency=50.0"
@@ -181,23 +165,22 @@ def test_a_run_resumes_to_the_same_bits(shared_tmp_path):
         assert evaluation.compliance == pytest.approx(one["compliance"], rel=1e-4)
 
 
-OF_FIRST = "arms.arm2.pattern=arm1"
+OF_FIRST, SHORTER = "arms.arm2.design=arm1", "arms.arm2.length=0.8"
 
 
 @pytest.mark.serial
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        (["arms.arm2.pattern=arm3"], ("arms.arm2.pattern", "arm3", '"arm1"')),
-        (["arms.arm1.pattern=arm2"], ("arms.arm1.pattern", "no arm before it")),
-        (["arms.arm1.rigid=true", OF_FIRST], ("arms.arm2.pattern", "no arm before it")),
+        (["arms.arm2.pattern=arm3"], ("arms.1.design (arm2)", "arm3", '"arm1"')),
+        (["arms.arm1.pattern=arm2"], ("arms.0.design (arm1)", "no arm before it")),
+        (["arms.arm1.rigid=true", OF_FIRST], ("arms.1.design (arm2)", "no arm before it")),
         ([OF_FIRST, "arms.arm2.cells=[20,4]"], ("arms.arm2.cells", "[20, 4]", "[40, 4]", "arm1")),
-        ([OF_FIRST, "arms.arm2.mesh=meshes/arm.geo"], ("pattern", "arm2 has mesh = ")),
-        (["arms.arm1.mesh=meshes/arm.geo", OF_FIRST], ("pattern", "arm1 has mesh = ")),
-        ([OF_FIRST, "arms.arm2.rigid=true"], ("pattern and rigid",)),
-        ([OF_FIRST, "arms.arm2.design=arm1"], ("design and pattern",)),
+        ([OF_FIRST, "arms.arm2.mesh=meshes/arm.geo"], ("arms.1.design", "arm2 has mesh = ")),
+        (["arms.arm1.mesh=meshes/arm.geo", OF_FIRST], ("arms.1.design", "arm1 has mesh = ")),
+        ([OF_FIRST, "arms.arm2.rigid=true"], ("design and rigid",)),
         ([OF_FIRST, "arms.arm2.passive=0.1"], ("arms.arm2.passive", "0.1", "none", "arm1")),
-        ([OF_FIRST, "arms.arm2.symmetric=true"], ("arms.arm2.symmetric", "none", "arm1")),
+        ([OF_FIRST, SHORTER, "arms.arm2.symmetric=true"], ("arms.arm2.symmetric", "none", "arm1")),
     ],
 )
 def test_what_cannot_be_a_pattern(changes, words):
@@ -208,9 +191,10 @@ def test_what_cannot_be_a_pattern(changes, words):
 @pytest.mark.serial
 def test_a_pattern_of_a_pattern_is_refused():
     three = [{"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01}]
-    three += [{"name": "arm2", "pattern": "arm1"}, {"name": "arm3", "pattern": "arm2"}]
+    three += [{"name": "arm2", "pattern": "arm1", "length": 0.9}]
+    three += [{"name": "arm3", "pattern": "arm2", "length": 0.8}]
     data = {"material": "POM", "arms": three}
-    with refused("arms.2.pattern (arm3)", "arm2", "arm1"):
+    with refused("arms.2.design (arm3)", "arm2", "arm1"):
         do.scene_from_dict(STATED | data)
     # Identical arms may share the mesh of one that repeats another's design.
     three[2] = {"name": "arm3", "design": "arm2"}
@@ -223,7 +207,7 @@ def test_an_arm_takes_from_its_pattern_not_from_the_arm_before():
     one = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01, "passive": 0.03}
     one |= {"symmetric": True, "regions": [{"kind": "void", "circle": [0.5, 0.0, 0.01]}]}
     other = {"name": "arm2", "passive": 0.1, "symmetric": False, "regions": []}
-    data = {"material": "POM", "arms": [one, other, {"name": "arm3", "pattern": "arm1"}]}
+    data = {"material": "POM", "arms": [one, other, {"name": "arm3", "design": "arm1", "length": 0.9}]}
     third = do.scene_from_dict(STATED | data).arms[2]
     assert third.passive is None and not third.symmetric and third.regions == ()
 

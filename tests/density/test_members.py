@@ -119,7 +119,7 @@ def test_one_width_is_that_of_members_and_gaps(key):
 def test_what_repeats_a_design_smaller_keeps_the_width():
     """The filter of the pattern is wider by as much as the smallest copy is smaller."""
     width = ("design.projection=robust", "design.minimum_member=0.015")
-    small = ("arms.arm2.pattern=arm1", "arms.arm2.height=0.048", "arms.arm2.length=0.9")
+    small = ("arms.arm2.design=arm1", "arms.arm2.height=0.048", "arms.arm2.length=0.9")
     scene = do.load_scene(TWO_ARM, (*width, *small))
     assert scene.filter_radius(0) == pytest.approx(scene.design.radius / 0.8)
     plain = do.load_scene(TWO_ARM, small)  # without a width it is the stated radius
@@ -279,7 +279,7 @@ REFUSED = [  # keys changed; key, value and what is expected
      ("minimum_member = 0.08", "0.06477 [m]", "4.32 times minimum_gap")),
     ([ROBUSTLY, "design.minimum_member=0.015", "design.minimum_gap=0.035"],
      ("0.015 [m]", "0.035 [m]", "height of arm")),
-    ([ROBUSTLY, "design.minimum_member=0.018", "arms.arm2.pattern=arm1", "arms.arm2.height=0.05"],
+    ([ROBUSTLY, "design.minimum_member=0.018", "arms.arm2.design=arm1", "arms.arm2.height=0.05"],
      ("0.018", "a third of the height", "arm1", "0.01667")),
 ]  # fmt: skip
 

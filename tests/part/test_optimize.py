@@ -118,7 +118,7 @@ def test_slopes_of_a_repeated_design_are_differences(tmp_path):
     """An arm that repeats the other's design smaller has the same variables."""
     size = 0.8, 0.75  # length and height over arm1's
     sizes = f"arms.arm2.length={size[0]}", f"arms.arm2.height={0.06 * size[1]}"
-    changes = ("arms.arm2.pattern=arm1", *sizes, "arms.cells=[100,6]", "design.projection=robust",
+    changes = ("arms.arm2.design=arm1", *sizes, "arms.cells=[100,6]", "design.projection=robust",
                "simulation.sample=0.005")  # fmt: skip
     posed = with_tables(runs.scene(*changes), objective={"kind": "integral_compliance"})
     images = frame, lambda x, y: frame(x / size[0], y / size[1])

@@ -150,7 +150,7 @@ PUSHED_FORK = (
     '{arm="link", moment=[0.5,1.0,2.0], table="FOLDER/twist.csv", frame="arm"}]'
 )
 REPEATED = (
-    "arms.cells=[40,4]", "arms.passive=0.05", "arms.arm2.pattern=arm1", "arms.arm2.length=0.8",
+    "arms.cells=[40,4]", "arms.passive=0.05", "arms.arm2.design=arm1", "arms.arm2.length=0.8",
     "arms.arm2.height=0.045", "arms.arm2.thickness=0.012", "arms.symmetric=true",
     'arms.arm1.regions=[{kind="void", circle=[0.5, 0.0, 0.016]}, '
     '{kind="solid", box=[0.2, -0.03, 0.3, -0.01]}]',

@@ -290,7 +290,6 @@ BAD_VALUES = [
     ("arms.0.height arms.0.thickness arms.0.mesh_size", [0.0, -0.06], LENGTHS),
     ("arms.0.thickness", [math.inf], "a finite number >= 1e-06 and <= 10000"),
     ("arms.0.design arms.1.design", ["arm2"], "an earlier arm with a design of its own"),
-    ("arms.0.pattern", ["arm2"], "an earlier arm with a design of its own"),
     ("arms.0.rigid arms.0.symmetric objective.follow design.shared_volume", [1], FLAGS),
     ("arms.0.centre", [[0, 0, 0]], "none with rigid = false"),
     ("arms.0.mass arms.0.inertia", [1.0], "none with rigid = false"),
@@ -518,9 +517,7 @@ CONTRADICTIONS = [
      'at most 7, the degrees of freedom of arm "arm2" with cells = [2, 1]'),
     (2, {"arms.1.height": -1}, "arms.1.height (arm2) = -1", "(height in the plane of motion"),
     # An arm that shares a design.
-    (2, SHARED | {"arms.1.length": 0.9}, "arms.1.length (arm2) = 0.9", "1.0 as arm1"),
-    (2, SHARED | {"arms.1.density": 1.0}, "arms.1.density (arm2) = 1.0", "no value"),
-    (2, SHARED | {"arms.1.rigid": True}, "arms.1", "only one of design, pattern"),
+    (2, SHARED | {"arms.1.rigid": True}, "arms.1", "only one of design, rigid and sid"),
     (2, {"arms.1.design": "arm3"}, "arms.1.design", 'design of its own: "arm1"'),
     # Limits and what they need.
     (2, {"objective.kind": "mass", "constraints.mass": 1.0}, "objective", "under [constraints]"),

@@ -157,7 +157,7 @@ class FreeSides:
         if self.solid is not None or not all(c is None or isinstance(c, Line) for c in curves):
             raise InputError(
                 f"--optimize: arm {part.name!r} repeats a design with circles, or of a solid "
-                "(arms.pattern), which it would stretch; leave --optimize out"
+                "(arms.design), which it would stretch; leave --optimize out"
             )
         ratio = np.ones(self.sides.numbers[0])
         loops = []

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, model_validator
 from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
@@ -130,9 +130,9 @@ CELLS_ACROSS = 12  # the height of an arm from a STEP file without mesh_size
 SOLID_CELLS_ACROSS = 4  # the smaller of height and thickness of a solid one
 # never taken from the arm before
 OWN_KEYS = (
-    "name", "design", "pattern", "rigid", "mass", "inertia", "centre", "sid", "interfaces",
+    "name", "design", "rigid", "mass", "inertia", "centre", "sid", "interfaces",
 )  # fmt: skip
-# What an arm with a pattern has from there.
+# What an arm with another's design, scaled, has from there.
 PATTERN_KEYS = ("passive", "symmetric", "extruded", "regions")
 
 
@@ -242,12 +242,10 @@ class Arm(Table):
         ge=0,
     )
     design: str | None = setting(
-        None, "name of an earlier arm whose mesh and design this one shares [-]"
-    )
-    pattern: str | None = setting(
         None,
-        "name of an earlier arm whose design this one repeats, scaled to its own "
-        "length and height, cell by cell [-]",
+        "name of an earlier arm whose design this one has: one mesh and one body for both where "
+        "they are alike but for their joints, else scaled to its own length and height, cell by "
+        "cell [-]",
     )
     rigid: bool = setting(False, "a rigid bar of solid material, not optimised [-]")
     mass: float | None = setting(
@@ -294,14 +292,16 @@ class Arm(Table):
         "whose design this one shares alone, the bores with the mesh of the arm before",
     )
 
+    _scaled: bool = PrivateAttr(False)
+
     @model_validator(mode="after")
     def _check_kind(self) -> Arm:
-        stated = [key for key in ("design", "pattern", "sid") if getattr(self, key) is not None]
+        stated = [key for key in ("design", "sid") if getattr(self, key) is not None]
         if self.rigid:
             stated.append("rigid")
         if len(stated) > 1:
             raise Refusal(
-                f"expected only one of design, pattern, rigid and sid, found "
+                f"expected only one of design, rigid and sid, found "
                 f"{' and '.join(stated)}",
                 *stated,
             )
@@ -350,7 +350,7 @@ class Arm(Table):
                 "wall",
                 "hollow",
             )
-        for key in ("extruded", "pattern", "regions", "interfaces"):
+        for key in ("extruded", "regions", "interfaces"):
             if getattr(self, key):
                 raise Refusal("expected none with hollow = true", key, "hollow")
         if self.element not in (None, "incompatible"):
@@ -441,12 +441,36 @@ class Arm(Table):
     @property
     def own(self) -> bool:
         """Whether the arm has a mesh and a body of its own."""
-        return self.flexible and self.design is None
+        return self.flexible and not self.shares
+
+    @property
+    def shares(self) -> bool:
+        """Whether the arm has mesh and body of the arm whose design it has."""
+        return self.design is not None and not self._scaled
+
+    @property
+    def pattern(self) -> str | None:
+        """Name of the arm whose design this one repeats, scaled; None of others."""
+        return self.design if self._scaled else None
+
+    def like(self, owner: Arm | None) -> Arm:
+        """Return this arm as one that has its owner's design, shared or scaled."""
+        scaled = owner is not None and bool(self.differences(owner))
+        if scaled == self._scaled:
+            return self
+        result = self.unchecked_copy({})
+        result._scaled = scaled
+        return result
+
+    def differences(self, owner: Arm) -> list[str]:
+        """Return the keys in which it differs from another arm, joints and names aside."""
+        keys = [key for key in Arm.model_fields if key not in ("name", "design", *JOINT_KEYS)]
+        return [key for key in keys if getattr(self, key) != getattr(owner, key)]
 
     @property
     def designed(self) -> bool:
         """Whether the arm has design variables of its own."""
-        return self.own and self.pattern is None
+        return self.flexible and self.design is None
 
     @property
     def flexible(self) -> bool:
@@ -685,8 +709,8 @@ class Arm(Table):
         check_regions(self)
         if self.pattern is not None:
             self._check_pattern(before)
-        if self.design is not None:
-            self._check_shared(before)
+        elif self.design is not None and self.design not in {a.name for a in before if a.own}:
+            self._refuse_design([arm.name for arm in before if arm.own])
 
     def _check_material(self, scene: Scene, index: int) -> None:
         """Refuse an own material, or the scene's, that this arm cannot be made of."""
@@ -733,54 +757,42 @@ class Arm(Table):
         if self.centre is not None:
             raise Refusal(f"expected none {plane}", ".centre")
 
-    def _check_shared(self, before: tuple[Arm, ...]) -> None:
-        owners = {arm.name: arm for arm in before if arm.own}
-        if self.design not in owners:
-            allowed = " | ".join(map(shown, owners)) or "no arm before it has one"
-            raise Refusal(
-                f"expected the name of an earlier arm with a design of its own: {allowed}",
-                ".design",
-            )
-        for key in Arm.model_fields:
-            value = getattr(owners[self.design], key)
-            if (
-                key not in ("name", "design", "pattern", *JOINT_KEYS)
-                and getattr(self, key) != value
-            ):
-                expected = f"{shown(value)} as {self.design} has"
-                if value is None:
-                    expected = f"no value, as in {self.design}"
-                raise Refusal(
-                    f"expected {expected}, whose design it shares",
-                    f".{key}",
-                    ".design",
-                )
+    def _refuse_design(self, names: list[str], hint: str = "") -> None:
+        allowed = " | ".join(map(shown, names)) or "no arm before it has one"
+        raise Refusal(
+            f"expected the name of an earlier arm with a design of its own: {allowed}{hint}",
+            ".design",
+        )
 
     def _check_pattern(self, before: tuple[Arm, ...]) -> None:
         """Refuse a pattern that is none, or whose cells are not this arm's one by one."""
         designed = {arm.name: arm for arm in before if arm.designed}
         if self.pattern not in designed:
-            others = {arm.name: arm.pattern or arm.design for arm in before}
-            allowed = " | ".join(map(shown, designed)) or "no arm before it has one"
+            others = {arm.name: arm.design for arm in before}
             origin = others.get(str(self.pattern))
             hint = f"; {self.pattern} itself has that of {origin}" if origin else ""
-            raise Refusal(
-                f"expected the name of an earlier arm with a design of its own: {allowed}{hint}",
-                ".pattern",
-            )
+            self._refuse_design(list(designed), hint)
+        assert self.pattern is not None
         pattern = designed[self.pattern]
         if pattern.interfaces:
             raise Refusal(
                 f"expected an arm without interfaces: {self.pattern} has some, around which cells "
                 "stay solid",
-                ".pattern",
+                ".design",
+            )
+        if self.hollow or pattern.hollow:
+            raise Refusal(
+                f"expected that of {self.pattern}, whose design it has: walls are not scaled",
+                f".{self.differences(pattern)[0]}",
+                ".design",
             )
         for item, name in ((pattern, self.pattern), (self, self.name)):
             if item.mesh is not None:
                 raise Refusal(
-                    f"expected an arm made of cells, and cells of its own: {name} has mesh = "
-                    f"{shown(item.mesh)}, whose cells have no partners in another arm",
-                    ".pattern",
+                    f"expected an arm with cells, or the same {', '.join(self.differences(pattern))}"
+                    f" as it has: {name} has mesh = {shown(item.mesh)}, whose cells have no "
+                    "partners in another mesh",
+                    ".design",
                     ".mesh",
                 )
         if self.cells != pattern.cells:
@@ -788,7 +800,7 @@ class Arm(Table):
                 f"expected {shown(pattern.cells)} as {self.pattern} has, whose design it repeats "
                 "cell by cell",
                 ".cells",
-                ".pattern",
+                ".design",
             )
         for key in PATTERN_KEYS:
             stated, theirs = getattr(self, key), getattr(pattern, key)
@@ -797,7 +809,7 @@ class Arm(Table):
                     f"expected none: it is that of {self.pattern}, scaled, whose design this arm "
                     "repeats",
                     f".{key}",
-                    ".pattern",
+                    ".design",
                 )
 
 

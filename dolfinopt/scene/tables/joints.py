@@ -115,7 +115,7 @@ def check_interfaces(scene: Scene, index: int) -> None:
             ".interfaces",
         )
     if arm.pattern is not None:
-        raise Refusal("expected none with pattern", ".interfaces", ".pattern")
+        raise Refusal("expected none with the design of another arm, scaled", ".interfaces", ".design")
     celled = arm.flexible and arm.cells is not None
     known = [interface.name.casefold() for interface in arm.interfaces]
     for k, interface in enumerate(arm.interfaces):
@@ -139,9 +139,9 @@ def check_interfaces(scene: Scene, index: int) -> None:
 def check_used(scene: Scene) -> None:
     """Refuse interfaces on which nothing sits; those of arms of one design are the same."""
     for index, arm in enumerate(scene.arms):
-        if arm.design is not None:
+        if arm.shares:
             continue
-        sharing = [index, *(k for k, item in enumerate(scene.arms) if item.design == arm.name)]
+        sharing = [index, *(k for k, item in enumerate(scene.arms) if item.shares and item.design == arm.name)]
         for number, interface in enumerate(arm.further_interfaces, start=1):
             if not scene.used_interfaces & {(k, number) for k in sharing}:
                 raise Refusal(
