@@ -190,12 +190,12 @@ class Arm:
             beta: sharpness of the scene's projection.
         """
         filtered = self.filtered(x)
-        kind = self.scene.design.projection
-        if not kind:
+        design = self.scene.design
+        if not design.projection:
             return (filtered,)
         thresholds: Sequence[float] = (0.5,)
-        if kind == "robust":
-            eroded, nominal, dilated = robust_thresholds(*self.scene.design.erosions)
+        if design.is_robust:
+            eroded, nominal, dilated = robust_thresholds(*design.erosions)
             thresholds = (eroded, dilated, nominal)
         projected = [project(filtered.x_phys, beta, eta) for eta in thresholds]
         return tuple(

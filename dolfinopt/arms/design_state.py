@@ -257,7 +257,7 @@ class DesignState:
         """
         known = self._loaded.get(place)
         if known is None or not np.array_equal(known[0], carried):
-            count, guess = self.scene.objective.modes, self.initial.loaded.get(place)
+            count, guess = self.scene.objective.num_modes, self.initial.loaded.get(place)
             with self.elastic.profile.phase("vibration"):
                 known = carried, loaded_modes(self.elastic, carried, count, guess)
             self._loaded[place] = known

@@ -138,7 +138,7 @@ def part(
         with together(world):
             if world.rank == 0:
                 warn(dict.fromkeys(text for item in parts.values() for text in item.warnings))
-                made = Made(scene, parts, _meshes(parts, check or asked.optimize, say))
+                made = Made(scene, parts, _meshes(parts, check or bool(asked.optimize), say))
                 made = made.checked(folder, say) if check else made
                 if asked.optimize and made.meshes is not None:
                     made = made.optimized(folder, asked, check, say, kept.replace, known)

@@ -157,7 +157,7 @@ def _problem_by(
 ) -> Problem:
     """Return the problem at x with the other gradient (collective)."""
     other = evaluator.with_gradient(gradient)
-    if evaluator.scene.design.projection == "robust":
+    if evaluator.scene.design.is_robust:
         designs = other.evaluate_again(x)
     else:
         designs = [other.differentiated(nominal.physical, nominal.evaluation)]

@@ -61,7 +61,7 @@ class Evaluator:
         self.scene = self.scene.unchecked_copy({"motion": motion})
         with together(self.partition.world):
             designs = {k: arm.physical_designs(parts[k], beta) for k, arm in arms.items()}
-        count = 3 if self.scene.design.projection == "robust" else 1
+        count = 3 if self.scene.design.is_robust else 1
         variants = [
             {k: design[variant] for k, design in designs.items()} for variant in range(count)
         ]

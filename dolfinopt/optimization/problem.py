@@ -100,7 +100,7 @@ def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndar
     not fall apart.
     """
     result = [np.array(design.evaluation.smooth_limits) for design in designs]
-    if len(designs) > 1 and scene.design.limits_on == "nominal":
+    if len(designs) > 1 and scene.design.limits_nominal:
         eroded, nominal = (1.0 + np.array(designs[i].evaluation.constraints) for i in (0, -1))
         known = (eroded > 0.0) & (nominal > 0.0)  # what nothing loads has no share
         ratio = np.divide(eroded, nominal, out=np.ones_like(eroded), where=known)
@@ -136,7 +136,7 @@ def problem_of(
         for design, scale in zip(designs, scales, strict=True)
     ]
     own, binding = nominal.of_nominal, list(range(len(designs)))
-    if robust and scene.design.limits_on == "nominal":
+    if robust and scene.design.limits_nominal:
         binding = [0, len(designs) - 1]
     dfdx = np.empty((0, 0))
     if nominal.differentiated:
@@ -148,7 +148,7 @@ def problem_of(
         dfdx = np.vstack([by_nominal, *by_all])
     f0, df0dx = _objective(scene, designs)
     variants = [limits_of(scene, design.evaluation) for design in designs]
-    limits = variants[-1] if scene.design.limits_on == "nominal" else worst_limits(variants)
+    limits = variants[-1] if scene.design.limits_nominal else worst_limits(variants)
     rows = np.concatenate([np.flatnonzero(own), *[np.flatnonzero(~own)] * len(binding)])
     values = np.concatenate([f[-1][own], *(f[i][~own] for i in binding)])
     return Problem(f0, df0dx, values, dfdx, limits, rows, objective_of(scene).turned)

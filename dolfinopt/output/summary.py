@@ -606,7 +606,7 @@ def _against_contacts(scene: Scene, index: int, size: float) -> str:
     """Return what keeps contacts out of the next design of an arm."""
     design, radius = scene.design, scene.filter_radius(index)
     least = FILTER_CELLS * size
-    result = [] if design.projection == "robust" else ['design.projection = "robust"']
+    result = [] if design.is_robust else ['design.projection = "robust"']
     if result or design.erosion < EROSION:
         result.append(f"design.erosion = {EROSION:g}")
     if radius < least * (1.0 - 1e-9) or not result:

@@ -32,7 +32,7 @@ from dolfinopt.scene.load import Scene
 class Eigenfrequency(Response):
     """Squared longest period of every flexible arm, s2; its true value is the frequency, Hz.
 
-    With `objective.follow` that of the followed mode as objective; a limit is for all modes.
+    As objective with `objective.modes = "first"` that of the followed mode.
     """
 
     def squared_period(self, modes: LoadedModes) -> tuple[float, np.ndarray]:

@@ -123,6 +123,16 @@ def _way(tree: Tree, row: Row, value: Any) -> None:
         tree.setdefault("motion", {})["elbow"] = value
 
 
+def _eroded(tree: Tree, row: Row, value: Any) -> None:
+    robust = row.get("projection") == "robust"
+    row["projection"] = f"robust-{value}" if robust and value != "nominal" else row["projection"]
+
+
+def _first_mode(tree: Tree, row: Row, value: Any) -> None:
+    if value:
+        row["modes"] = "first" if value is True else value
+
+
 def _exact(tree: Tree, row: Row, value: Any) -> None:
     if value:
         tree.setdefault("objective", {})
@@ -153,6 +163,8 @@ OLD_WORDS = (
     OldWord("control.damping_factor", "control.damping times it", _scaled("damping"), 1.0),
     OldWord("optimizer.exact_iterations", 'objective.gradient = "exact"', _exact, 0),
     OldWord("simulation.integrator", "every motion is integrated by Radau IIA", None, "radau"),
+    OldWord("design.limits_on", 'design.projection = "robust-eroded"', _eroded, "nominal"),
+    OldWord("objective.follow", 'objective.modes = "first"', _first_mode, False),
     OldWord("closures.side", "motion.elbow", _way),
     OldWord("motion.base_position", "motion.base = the number", _fixed_at, 0.0),
     OldWord("constraints.path_speed", "motion.max_speed", _of_motion("max_speed")),

@@ -207,7 +207,10 @@ def test_an_arm_takes_from_its_pattern_not_from_the_arm_before():
     one = {"name": "arm1", "length": 1.0, "height": 0.06, "thickness": 0.01, "passive": 0.03}
     one |= {"symmetric": True, "regions": [{"kind": "void", "circle": [0.5, 0.0, 0.01]}]}
     other = {"name": "arm2", "passive": 0.1, "symmetric": False, "regions": []}
-    data = {"material": "POM", "arms": [one, other, {"name": "arm3", "design": "arm1", "length": 0.9}]}
+    data = {
+        "material": "POM",
+        "arms": [one, other, {"name": "arm3", "design": "arm1", "length": 0.9}],
+    }
     third = do.scene_from_dict(STATED | data).arms[2]
     assert third.passive is None and not third.symmetric and third.regions == ()
 

@@ -109,8 +109,16 @@ def test_run_is_resumed_in_the_same_bits_and_its_design_read_with_its_law(tmp_pa
     [
         (["feed_forward.kind=tip"], "feed_forward.kind"),
         (["objective.gradient=esl"], "objective.gradient"),
-        (["motion.shape=0", "objective.kind=duration", "motion.law=s-curve", "motion.max_speed=30",
-          "motion.duration=1.9"], "motion.shape"),
+        (
+            [
+                "motion.shape=0",
+                "objective.kind=duration",
+                "motion.law=s-curve",
+                "motion.max_speed=30",
+                "motion.duration=1.9",
+            ],
+            "motion.shape",
+        ),
         ([f"motion.shape={[0.01] * 9}"], "at most 8 coefficients"),
     ],
 )

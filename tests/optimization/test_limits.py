@@ -128,10 +128,9 @@ def test_limits_hold_for_the_worst_scenario():
     assert heavy == pytest.approx(0.01, rel=4e-3) and not result.violated
 
 
-@pytest.mark.parametrize("bound", ["nominal", "eroded"])
+@pytest.mark.parametrize("bound", ["robust", "robust-eroded"])
 def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass(bound):
-    changes = ["objective.kind=mass", "constraints.deviation=0.012", "design.projection=robust"]
-    changes += [f"design.limits_on={bound}"]
+    changes = ["objective.kind=mass", "constraints.deviation=0.012", f"design.projection={bound}"]
     built = scene(*changes, "design.erosion=0.2", iterations=1)
     arms = built_of(built)
     evaluator = Evaluator(built, arms.partition, arms.arms, arms.profile)
@@ -149,7 +148,8 @@ def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass(bound):
     rows = [problem.limits[k].quantity for k in problem.rows]
     own = problem.f[np.array(rows) == "deviation"]
     assert rows.count("volume_fraction") == 2
-    if bound == "eroded":  # every design's deviation is a row, and all are one limit in reports
+    # Every design's deviation is a row, and all are one limit in reports.
+    if bound == "robust-eroded":
         assert limits["deviation"].value == deviations[0]
         assert own == pytest.approx([one / 0.012 - 1.0 for one in deviations], rel=1e-9)
         return

@@ -295,8 +295,7 @@ def test_the_plane_has_closures_that_are_its_closure():
         ("pin", {"point": [0.25, 0.0]}, {"point": [0.25, 0.0, 0.0], "axis": [0.0, 0.0, 1.0]}),
     ):
         (one,), (other,) = (
-            loops_of(scene_from_dict(in_plane(kind, **given))).ties
-            for given in (flat, keys)
+            loops_of(scene_from_dict(in_plane(kind, **given))).ties for given in (flat, keys)
         )
         np.testing.assert_array_equal(one.point, other.point)
         normals = [[k.e for k in tie.equations] for tie in (one, other)]

@@ -290,7 +290,7 @@ BAD_VALUES = [
     ("arms.0.height arms.0.thickness arms.0.mesh_size", [0.0, -0.06], LENGTHS),
     ("arms.0.thickness", [math.inf], "a finite number >= 1e-06 and <= 10000"),
     ("arms.0.design arms.1.design", ["arm2"], "an earlier arm with a design of its own"),
-    ("arms.0.rigid arms.0.symmetric objective.follow design.shared_volume", [1], FLAGS),
+    ("arms.0.rigid arms.0.symmetric design.shared_volume", [1], FLAGS),
     ("arms.0.centre", [[0, 0, 0]], "none with rigid = false"),
     ("arms.0.mass arms.0.inertia", [1.0], "none with rigid = false"),
     ("arms.0.cells", [[0, 12], [0, 0]], "two integers >= 1"),
@@ -402,7 +402,6 @@ BAD_VALUES = [
     ("design.minimum", [0.0], "a number >= 1e-09 and < 1"),
     ("design.filter_radius", [1.001], "at most the length of the longest arm, 1.0 [m]"),
     ("design.projection", [True, 0, "tanh"], 'false | "heaviside" | "robust"'),
-    ("design.limits_on", ["dilated", True], '"nominal" | "eroded"'),
     ("design.sharpness interpolation.penalty", [0.9], "a number >= 1"),
     ("design.minimum_member design.minimum_gap", [-1e-9], "a number >= 0 and <= 10000"),
     ("part.minimum_member", [-1e-9], "a number >= 1e-06 and <= 10000"),
@@ -770,20 +769,16 @@ UNUSED = {
     "objective.attached": ("point-mass", ["constraints.first_frequency=1.0"]),
     "objective.elbow_angle": ("1.0", ["objective.kind=eigenfrequency"]),
     "objective.modes": ("2", ["objective.kind=eigenfrequency"]),
-    "objective.follow": ("true", ["objective.kind=eigenfrequency"]),
     "objective.scenarios": ("worst", ["scenarios=[{changes=['payload.mass=1']}]"]),
     "design.sharpness": ("64.0", ["design.projection=heaviside"]),
     "design.continuation": ("10", ["design.projection=heaviside"]),
     "design.erosion": ("0.2", ["design.projection=robust"]),
-    "design.limits_on": ("eroded", ["design.projection=robust"]),
 }
 # What does not: the wrong response, or none.
 OTHERS = {
     "objective.worst": ["objective.kind=integral_compliance"],
     "objective.effort_weights": ["constraints.peak_force=[9.0,9.0,9.0]"],
-    "objective.follow": ["constraints.first_frequency=1.0"],
     "design.erosion": ["design.projection=heaviside"],
-    "design.limits_on": ["design.projection=heaviside"],
 }
 
 

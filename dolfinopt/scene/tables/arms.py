@@ -301,8 +301,7 @@ class Arm(Table):
             stated.append("rigid")
         if len(stated) > 1:
             raise Refusal(
-                f"expected only one of design, rigid and sid, found "
-                f"{' and '.join(stated)}",
+                f"expected only one of design, rigid and sid, found {' and '.join(stated)}",
                 *stated,
             )
         if self.regions and not self.flexible:
@@ -789,8 +788,8 @@ class Arm(Table):
         for item, name in ((pattern, self.pattern), (self, self.name)):
             if item.mesh is not None:
                 raise Refusal(
-                    f"expected an arm with cells, or the same {', '.join(self.differences(pattern))}"
-                    f" as it has: {name} has mesh = {shown(item.mesh)}, whose cells have no "
+                    f"expected an arm with cells, or the same "
+                    f"{', '.join(self.differences(pattern))} as it has: {name} has mesh = {shown(item.mesh)}, whose cells have no "
                     "partners in another mesh",
                     ".design",
                     ".mesh",

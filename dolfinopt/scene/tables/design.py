@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
     from dolfinopt.scene.tables.arms import Arm
 
-Projection = Literal[False, "heaviside", "robust"]
+Projection = Literal[False, "heaviside", "robust", "robust-eroded"]
 # Largest distance of a threshold from 1/2 that is chosen for the wider one of member and gap:
 # beyond it the eroded design is hardly there, or the dilated one everywhere.
 WIDEST = 0.45
@@ -36,7 +36,7 @@ class Design(Table):
 
     USES = (
         Use("sharpness continuation", "projection"),
-        Use("erosion limits_on minimum_member minimum_gap", "projection", "robust"),
+        Use("erosion minimum_member minimum_gap", "projection", "robust robust-eroded"),
         Use("shared_volume", "volume_fraction"),
     )
 
@@ -59,8 +59,9 @@ class Design(Table):
     )
     projection: Projection = setting(
         False,
-        "projection after the filter: none, Heaviside, or robust (eroded, nominal "
-        "and dilated designs together) [-]",
+        "projection after the filter: none, Heaviside, or robust (eroded, nominal and dilated "
+        'designs together); limits hold for the nominal one, as it is meant, with "robust-eroded" '
+        "for every one of them [-]",
     )
     sharpness: float = setting(128.0, "final beta of the projection [-]", ge=1, le=1e4)
     continuation: int = setting(
@@ -73,11 +74,6 @@ class Design(Table):
         ge=1e-3,
         le=0.499,
     )
-    limits_on: Literal["nominal", "eroded"] = setting(
-        "nominal",
-        "which of the robust projection's designs keeps the limits: the nominal one, "
-        'as it is meant, or "eroded", every one of them [-]',
-    )
     minimum_member: float = setting(
         0.0,
         "smallest width of members with the robust projection; sets the filter "
@@ -88,6 +84,16 @@ class Design(Table):
     minimum_gap: float = setting(
         0.0, "smallest width of gaps between members alike; 0: minimum_member [m]", ge=0, le=1e4
     )
+
+    @property
+    def is_robust(self) -> bool:
+        """Whether an eroded, a nominal and a dilated design are optimised together."""
+        return self.projection in ("robust", "robust-eroded")
+
+    @property
+    def limits_nominal(self) -> bool:
+        """Whether limits hold for the nominal design alone."""
+        return self.projection != "robust-eroded"
 
     @property
     def controls_widths(self) -> bool:

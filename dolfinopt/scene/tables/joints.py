@@ -115,7 +115,9 @@ def check_interfaces(scene: Scene, index: int) -> None:
             ".interfaces",
         )
     if arm.pattern is not None:
-        raise Refusal("expected none with the design of another arm, scaled", ".interfaces", ".design")
+        raise Refusal(
+            "expected none with the design of another arm, scaled", ".interfaces", ".design"
+        )
     celled = arm.flexible and arm.cells is not None
     known = [interface.name.casefold() for interface in arm.interfaces]
     for k, interface in enumerate(arm.interfaces):
@@ -141,7 +143,10 @@ def check_used(scene: Scene) -> None:
     for index, arm in enumerate(scene.arms):
         if arm.shares:
             continue
-        sharing = [index, *(k for k, item in enumerate(scene.arms) if item.shares and item.design == arm.name)]
+        sharing = [
+            index,
+            *(k for k, item in enumerate(scene.arms) if item.shares and item.design == arm.name),
+        ]
         for number, interface in enumerate(arm.further_interfaces, start=1):
             if not scene.used_interfaces & {(k, number) for k in sharing}:
                 raise Refusal(

@@ -116,7 +116,8 @@ class Motion(Table):
         le=0.5,
     )
     max_speed: PathLimit | None = setting(
-        None, "limit of the speed along the path; of a law with variables (shape) a constraint [m/s]"
+        None,
+        "limit of the speed along the path; of a law with variables (shape) a constraint [m/s]",
     )
     max_acceleration: PathLimit | None = setting(
         None, "limit of the acceleration along the path, alike [m/s2]"
@@ -336,7 +337,7 @@ class Motion(Table):
             )
         if rates and not self.coefficients and self.law in PROFILES:
             raise Refusal(
-                "expected 1 at least with limits along the path, which shape this law by themselves",
+                "expected 1 at least with limits along the path, which shape this law",
                 "motion.shape",
                 key,
             )

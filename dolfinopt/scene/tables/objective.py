@@ -47,6 +47,8 @@ SPATIAL_LOADS: tuple[SpatialLoad, ...] = (
     (0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
     (0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
 )
+ModeCount = Annotated[int, Field(ge=1, le=50)]
+TRACKED_AMONG = 6  # lowest modes: what becomes of the first one ends among them
 Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 
 
@@ -124,12 +126,21 @@ class Objective(Table):
         ge=-100,
         le=100,
     )
-    modes: int = setting(
-        3, "number of lowest modes in the p-mean of the eigenfrequency [-]", ge=1, le=50
+    modes: ModeCount | Literal["first"] = setting(
+        3,
+        'number of lowest modes in the p-mean of the eigenfrequency; "first": as objective the '
+        "initial design's first mode alone, tracked by its MAC value [-]",
     )
-    follow: bool = setting(
-        False, "track the initial design's first mode by its MAC value in place of the p-mean [-]"
-    )
+
+    @property
+    def follow(self) -> bool:
+        """Whether the initial design's first mode is tracked."""
+        return self.modes == "first"
+
+    @property
+    def num_modes(self) -> int:
+        """How many modes are computed."""
+        return TRACKED_AMONG if isinstance(self.modes, str) else self.modes
 
     @field_validator("loads")
     @classmethod
@@ -204,6 +215,13 @@ class Objective(Table):
 
     def _check_unused(self, scene: Scene) -> None:
         """Refuse options that neither the objective nor a limit uses."""
+        if self.follow and self.kind != "eigenfrequency":
+            raise Refusal(
+                'expected a number without objective.kind = "eigenfrequency": limits are for all '
+                "modes",
+                "objective.modes",
+                "objective.kind",
+            )
         fields = type(self).model_fields
         for key in unused_options(fields, self.kind, scene.limits):
             default = fields[key].default

@@ -303,7 +303,7 @@ DECLARED: dict[str, Declaration] = {
                 lower=True,
                 options=("attached", "elbow_angle", "modes"),
             ),
-            options=("attached", "elbow_angle", "modes", "follow"),
+            options=("attached", "elbow_angle", "modes"),
             stands_for="first frequency",
             natural="maximize",
             of_arms=True,
