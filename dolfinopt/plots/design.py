@@ -271,14 +271,11 @@ def fill_cells(
     values: np.ndarray,
     colours: str = COLOURS,
     largest: float = 1.0,
-    **look: Any,
 ) -> None:
     """Draw cells (n, k, 2) in the colours of their values from 0 to `largest`."""
     polygons: Any = corners  # as one array: a list would become a path a cell in Python
     # Blended edges would let the ground shine through between neighbours.
-    cells = PolyCollection(
-        polygons, cmap=colours, antialiaseds=False, lw=0.0, rasterized=True, **look
-    )
+    cells = PolyCollection(polygons, cmap=colours, antialiaseds=False, lw=0.0, rasterized=True)
     cells.set_array(values)
     cells.set_clim(0.0, largest)
     axes.add_collection(cells, autolim=False)

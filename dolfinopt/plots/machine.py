@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from matplotlib.lines import Line2D
@@ -17,6 +17,7 @@ from dolfinopt.plots.poses import Poses, body_poses, even_instants, shown_poses
 from dolfinopt.plots.style import GREY, ORANGE, PathLike, decimals, round_number, styled
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -50,6 +51,10 @@ class Stage(Protocol):
 
     def keep(self) -> None:
         """Keep what has been drawn so far in all frames."""
+        ...
+
+    def moving(self) -> list[Artist]:
+        """Return what differs from frame to frame, the lowest first."""
         ...
 
     def clear(self) -> None:
@@ -251,7 +256,7 @@ def draw_motion(
     speed = float(np.ptp(trajectory.t)) / (1e-3 * delay * count)
     drawn = film_stage(views, film, speed)
     try:
-        return _write(Path(path), drawn, film, delay)
+        return _write(Path(path), Frames(drawn, film), delay)
     finally:
         drawn.close()
 
@@ -267,32 +272,48 @@ def film_stage(views: Sequence[ArmView], film: Film, speed: float) -> Stage:
     return drawn
 
 
-def draw_frame(drawn: Stage, film: Film, k: int) -> np.ndarray:
-    """Return a frame (height, width, 3), uint8."""
-    drawn.clear()
-    drawn.path(film.rigid.skeleton(k), GREY)
-    drawn.path(film.trace[: film.at[k] + 1], ORANGE)
-    drawn.pose(k)
-    drawn.render()
-    clock = f"t = {film.t[k]:.{decimals(film.t)}f} s"
-    drawn.axes.set_title(clock, loc="right")
-    canvas = drawn.figure.canvas
-    canvas.draw()
-    return np.array(canvas.buffer_rgba())[:, :, :3]  # type: ignore[attr-defined]
+class Frames:
+    """The frames of a film: what stands still is drawn once, the rest over it every time."""
+
+    def __init__(self, drawn: Stage, film: Film) -> None:
+        """Draw what stands still."""
+        self.drawn, self.film = drawn, film
+        self.clock = drawn.axes.set_title("", loc="right")
+        self.canvas: Any = drawn.figure.canvas
+        self.canvas.draw()
+        self.still = self.canvas.copy_from_bbox(drawn.figure.bbox)
+
+    def __len__(self) -> int:
+        """Count them."""
+        return len(self.film.at)
+
+    def draw(self, k: int) -> np.ndarray:
+        """Return a frame (height, width, 3), uint8."""
+        drawn, film = self.drawn, self.film
+        drawn.clear()
+        drawn.path(film.rigid.skeleton(k), GREY)
+        drawn.path(film.trace[: film.at[k] + 1], ORANGE)
+        drawn.pose(k)
+        drawn.render()
+        self.clock.set_text(f"t = {film.t[k]:.{decimals(film.t)}f} s")
+        self.canvas.restore_region(self.still)
+        for artist in (*drawn.moving(), self.clock):
+            drawn.axes.draw_artist(artist)
+        return np.array(self.canvas.buffer_rgba())[:, :, :3]
 
 
-def _write(path: Path, drawn: Stage, film: Film, delay: float) -> Path:
+def _write(path: Path, frames: Frames, delay: float) -> Path:
     """Write all frames in the same few colours."""
     # A palette of each frame's own would take longer to find than the frame to draw, and would let
     # the colours flicker.
-    count = len(film.at)
+    count = len(frames)
     palette = Image.new("P", (1, 1))
-    samples = np.stack([draw_frame(drawn, film, k) for k in (0, count // 2, count - 1)])
+    samples = np.stack([frames.draw(k) for k in (0, count // 2, count - 1)])
     palette.putpalette(common_colours(samples).tobytes())
 
     def pictures() -> Iterator[Image.Image]:
         for k in range(count):
-            frame = Image.fromarray(draw_frame(drawn, film, k))
+            frame = Image.fromarray(frames.draw(k))
             yield frame.quantize(palette=palette, dither=Image.Dither.NONE)
 
     first, *others = pictures()

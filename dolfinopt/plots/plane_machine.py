@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib import colormaps
+from matplotlib.artist import Artist
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.patches import Polygon
+from matplotlib.path import Path as Shape
 
 from dolfinopt.multibody.closures import Along, Tie
 from dolfinopt.multibody.tree import GROUND
 from dolfinopt.output.design import ArmView
-from dolfinopt.plots.design import boundary, fill_cells, sides
+from dolfinopt.plots.design import boundary, sides
 from dolfinopt.plots.poses import Poses
 from dolfinopt.plots.style import (
     COLOURS,
@@ -30,6 +33,7 @@ SIDES = (0.75, 0.95)  # inches left and right of the axes, for y and for the sca
 ROOM = 0.13  # around what is seen, of the arms' reach: for the instants
 CART, TOP = np.array([0.06, 0.045]), 0.25  # half width and height of a cart; top of a pedestal
 BLOCK = np.array([0.06, 0.036])  # half length and half height of a slider
+SHADES = 256  # colours of densities
 THIN, BAR, DOT = 1.0, 5.0, 5.0  # points: lines, rigid arms, joints
 
 
@@ -98,9 +102,28 @@ class PlaneStage:
             return
         corners = self.poses.material(view.corners, view.modes, i, n)
         there = view.density > SOLID_FROM
-        fill_cells(self.axes, corners[there], view.density[there], alpha=strength)
+        self._fill(corners[there], view.density[there], strength)
         rim = LineCollection(sides(corners)[self.rims[i]], colors=GREY, lw=0.5 * THIN)
         self.axes.add_collection(rim, autolim=False)
+
+    def _fill(self, corners: np.ndarray, density: np.ndarray, strength: float) -> None:
+        """Fill cells (n, k, 2) by their densities; those of one colour are one path.
+
+        So they have no seams, and a path is made for a colour, not for a cell.
+        """
+        levels = np.round(density * (SHADES - 1)).astype(int)
+        shown, paths = np.unique(levels), []
+        codes = np.full(corners.shape[1] + 1, Shape.LINETO)
+        codes[[0, -1]] = Shape.MOVETO, Shape.CLOSEPOLY
+        for level in shown:
+            cells = corners[levels == level]
+            closed = np.concatenate([cells, cells[:, :1]], axis=1)
+            paths.append(Shape(closed.reshape(-1, 2), np.tile(codes, len(cells))))
+        # Paler colours, not transparent ones: where neighbours overlap by a pixel these darken.
+        colours = 1.0 - strength * (1.0 - colormaps[COLOURS](shown / (SHADES - 1))[:, :3])
+        cells = PathCollection(paths, facecolors=colours, antialiaseds=False, lw=0.0)
+        cells.set_rasterized(True)
+        self.axes.add_collection(cells, autolim=False)
 
     def _draw_support(self, place: np.ndarray, moves: bool, strength: float = 1.0) -> None:
         """Draw a cart below a joint, or a pedestal on its ground."""
@@ -132,11 +155,15 @@ class PlaneStage:
         """Keep what has been drawn so far in all frames."""
         self.kept = set(self.axes.get_children())
 
+    def moving(self) -> list[Artist]:
+        """Return what was drawn since, the lowest first."""
+        since = (artist for artist in self.axes.get_children() if artist not in self.kept)
+        return sorted(since, key=Artist.get_zorder)
+
     def clear(self) -> None:
         """Take away what was drawn since."""
-        for artist in self.axes.get_children():
-            if artist not in self.kept:
-                artist.remove()
+        for artist in self.moving():
+            artist.remove()
 
     def render(self) -> None:
         """Nothing: what was drawn is in the figure."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.artist import Artist
 
 from dolfinopt.multibody.tree import GROUND
 from dolfinopt.output.design import ArmView
@@ -117,6 +118,10 @@ class SolidStage:
     def keep(self) -> None:
         """Keep what has been drawn so far in all frames."""
         self.kept = set(self.studio.plotter.actors)
+
+    def moving(self) -> list[Artist]:
+        """Return the rendered image, and what stands over it."""
+        return [item for item in self.axes.get_children() if item is not self.axes.patch]
 
     def clear(self) -> None:
         """Take away what was drawn since."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bodies import plane_body, plane_chain
 from machines import GAINS, controlled, loop
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import PathCollection
 from mpi4py import MPI
 from PIL import Image
 from runs import ROOT
@@ -260,8 +260,8 @@ def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
         shown(curves.deviation_figure(t, deviation, 1.3 * deviation))
 
 
-def cells_of(axes) -> list[PolyCollection]:
-    return [each for each in axes.collections if isinstance(each, PolyCollection)]
+def cells_of(axes) -> list[PathCollection]:
+    return [each for each in axes.collections if isinstance(each, PathCollection)]
 
 
 @pytest.mark.parametrize("magnification", [1.0, 20.0])
@@ -307,13 +307,14 @@ def test_film_has_all_labels_inside_and_one_scale(arms, magnification):
     moving.q_e = moving.q_e / magnification
     film = machine.make_film(moving, magnification, 3)
     stage = machine.film_stage(views, film, 0.333)
-    machine.draw_frame(stage, film, 1)
+    frames = machine.Frames(stage, film)
+    frames.draw(1)
     assert f"deformation x {magnification:g}" in stage.figure.texts[0].get_text()
     spans = np.ptp([stage.axes.get_xlim(), stage.axes.get_ylim()], axis=1)
     box = stage.axes.get_window_extent()
     assert spans[0] / box.width == pytest.approx(spans[1] / box.height)
     assert len(cells_of(stage.axes)) == arms  # of the frame before nothing is left
-    machine.draw_frame(stage, film, 2)
+    frames.draw(2)
     assert len(cells_of(stage.axes)) == arms
     shown(stage.figure)
 
@@ -352,7 +353,7 @@ def test_machine_shows_every_arm_where_it_is(arms):
     cells = cells_of(axes)
     assert len(cells) == arms * len(at)
     # Void is left open: half of each arm's 80 cells.
-    assert {len(each.get_paths()) for each in cells} == {40}
+    assert {sum(len(path) for path in each.get_paths()) for each in cells} == {40 * 5}
     ends = [line.get_xydata()[0] for line in axes.lines if line.get_markersize() == 10.0]
     np.testing.assert_allclose(ends, rigid.end[at])
     solid = np.abs(shown(figure) - [8, 29, 88]).max(axis=2) < 12
@@ -388,8 +389,9 @@ def test_magnified_loops_stay_closed():
     assert np.abs(sag).max() > 0.04
     assert np.abs(film.bent.end[:, 1]).max() < 0.25 * np.abs(sag).max()
     stage = machine.film_stage(views, film, 0.5)
+    frames = machine.Frames(stage, film)
     for frame in range(9):
-        machine.draw_frame(stage, film, frame)
+        frames.draw(frame)
         (block,) = [p for p in stage.axes.patches if p.get_alpha() is not None]
         np.testing.assert_allclose(block.get_xy()[:4].mean(axis=0), film.bent.end[frame])
     assert "0.5 kg" in stage.figure.legends[0].texts[-1].get_text()

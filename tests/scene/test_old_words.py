@@ -41,7 +41,7 @@ def test_a_scene_in_older_words_is_that_in_those_of_now(used, old, new) -> None:
 def test_upgrade_rewrites_a_file(tmp_path) -> None:
     """Comments and order stay; the file as it was is kept beside it."""
     text = TWO_ARM.read_text(encoding="utf-8")
-    older = text.replace("[motion]", '[motion]\nbase = "fixed"\nbase_position = 0.1  # m')
+    older = text.replace("[motion]", '[motion]\nbase = "fixed"\nbase_position = 0.1')
     older = older.replace("projection = false", 'projection = "robust"\nlimits_on = "eroded"')
     file = tmp_path / "scene.toml"
     file.write_text(older, encoding="utf-8")

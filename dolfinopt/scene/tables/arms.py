@@ -789,7 +789,8 @@ class Arm(Table):
             if item.mesh is not None:
                 raise Refusal(
                     f"expected an arm with cells, or the same "
-                    f"{', '.join(self.differences(pattern))} as it has: {name} has mesh = {shown(item.mesh)}, whose cells have no "
+                    f"{', '.join(self.differences(pattern))} as it has: {name} has mesh = "
+                    f"{shown(item.mesh)}, whose cells have no "
                     "partners in another mesh",
                     ".design",
                     ".mesh",
