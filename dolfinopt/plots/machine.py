@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 from matplotlib.lines import Line2D
@@ -19,6 +19,7 @@ from dolfinopt.plots.style import GREY, ORANGE, PathLike, decimals, round_number
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     from dolfinopt.dynamics.build import Trajectory
@@ -279,7 +280,7 @@ class Frames:
         """Draw what stands still."""
         self.drawn, self.film = drawn, film
         self.clock = drawn.axes.set_title("", loc="right")
-        self.canvas: Any = drawn.figure.canvas
+        self.canvas = cast("FigureCanvasAgg", drawn.figure.canvas)
         self.canvas.draw()
         self.still = self.canvas.copy_from_bbox(drawn.figure.bbox)
 
