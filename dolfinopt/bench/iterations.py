@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from time import perf_counter
@@ -34,14 +34,14 @@ from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene, scene_from_dict, tomllib
 from dolfinopt.study.variants import changed
 
-# -- two arms against elements, on ranks, beside plain DOLFINx and pyMOTO ------------------------
+# -- two arms against elements, on ranks, beside plain DOLFINx --------------------------------
 
 CELLS = (200, 12), (400, 24), (800, 48), (1600, 96)
 DEMO, SETTLED = CELLS[:2]  # of demos/two_arm.toml, done in full; at which programs are compared
 COUNTED, FEW = 10, 4  # iterations of the others, of the largest
 OURS, STATIC = "dolfinopt, two arms with their motion", "dolfinopt, static, two arms"
 TWO_RANKS = f"{OURS}, two ranks"
-PLAIN, PYMOTO = "plain DOLFINx, static, one arm", "pyMOTO, static, one arm"
+PLAIN = "plain DOLFINx, static, one arm"
 
 
 def iterate(comm: MPI.Comm, scene: Scene) -> list[float]:
@@ -89,32 +89,31 @@ def _iterations(plan: Plan) -> Steps:
         yield name, cells[0] * cells[1], *found, memory
 
     def theirs(name: str, cells: Cells) -> Rows:
-        make = plain_iteration if name == PLAIN else pymoto_iteration
-        if one := make(plan.scene, cells):
-            x = np.full(cells[0] * cells[1], plan.scene.design.initial)
-            one(x)  # what is compiled, ordered and allocated once a run
-            found = timed(partial(one, x), max(3, plan.repeats))[:2]
-            yield name, cells[0] * cells[1], *found, *3 * [np.nan]
+        one = plain_iteration(plan.scene, cells)
+        x = np.full(cells[0] * cells[1], plan.scene.design.initial)
+        one(x)  # what is compiled, ordered and allocated once a run
+        found = timed(partial(one, x), max(3, plan.repeats))[:2]
+        yield name, cells[0] * cells[1], *found, *3 * [np.nan]
 
     for cells in CELLS[: 2 if plan.quick else None]:
-        for name in (OURS, *[TWO_RANKS] * bool(mpirun()), STATIC, PLAIN, PYMOTO):
-            do = theirs if name in (PLAIN, PYMOTO) else ours
+        for name in (OURS, *[TWO_RANKS] * bool(mpirun()), STATIC, PLAIN):
+            do = theirs if name == PLAIN else ours
             if do is ours or cells != CELLS[-1]:
                 yield f"{name}, {cells[0]} x {cells[1]} cells", partial(do, name, cells)
 
 
 ITERATION = Diagram(
     "iteration",
-    "A design iteration against elements, beside other programs in the same run",
+    "A design iteration against elements, beside plain DOLFINx in the same run",
     "program | elements per arm | iteration [s] | iteration, wall clock [s] | iterations | "
     "all iterations, wall clock [s] | peak memory [MB]",
     _iterations,
     "elements per arm",
     ("iteration, wall clock [s]", "peak memory [MB]"),
     "program",
-    "CPU seconds of the first rank, waiting for others included: median of whole iterations. Other "
-    "programs: K assembled and factorised anew (plain DOLFINx: MUMPS), one load, the gradient; the "
-    "least of the repeats. Memory is that of all ranks. pyMOTO: pip install 'dolfinopt[bench]'.",
+    "CPU seconds of the first rank, waiting for others included: median of whole iterations. Plain "
+    "DOLFINx: K assembled and factorised anew by MUMPS, one load, the gradient; the least of the "
+    "repeats. Memory is that of all ranks.",
 )
 
 
@@ -186,57 +185,6 @@ def plain_statics(
         found.x.scatter_forward()
         slopes = petsc.assemble_vector(gradient).array_r.copy()
         return float(load.dot(solution)), slopes
-
-    return iterate
-
-
-def pymoto_iteration(scene: Scene, cells: Sequence[int]) -> Iteration | None:
-    """Return the same by pyMOTO 1.5, https://github.com/aatmdelissen/pyMOTO; None: not there.
-
-    In the plane with a factor, in space by CG with three geometric grids, to its own 1e-7.
-    """
-    try:
-        import pymoto as pym
-    except ImportError:
-        return None
-    arm, solid, d = scene.arms[0], scene.material_of(0), len(cells)
-    thickness = arm.thickness / (cells[2] if d == 3 else 1)
-    edges = arm.length / cells[0], arm.height / cells[1], thickness
-
-    def grid(step: int) -> Any:
-        units = {f"unit{axis}": step * edge for axis, edge in zip("xyz", edges, strict=True)}
-        return pym.DomainDefinition(*(n // step for n in cells), **units)
-
-    domain = grid(1)
-    across = np.array([index.ravel() for index in np.indices([n + 1 for n in cells[1:]])])
-    left, right = (domain.get_nodenumber(at, *across) for at in (0, cells[0]))
-    force, fixed = np.zeros(d * domain.nnodes), (d * left[:, None] + np.arange(d)).ravel()
-    edge = [(at == 0) | (at == n) for at, n in zip(across, cells[1:], strict=True)]
-    force[d * right + 1] = np.prod(np.where(edge, 0.5, 1.0), axis=0) / np.prod(cells[1:])
-    density, load = pym.Signal("x", np.ones(domain.nel)), pym.Signal("f", force)
-    stiff, matrix, u, compliance = (pym.Signal(name) for name in "sKuc")
-    options = {"domain": domain, "bc": fixed, "plane": "stress"}
-    options |= {"e_modulus": solid.modulus, "poisson_ratio": solid.ratio}
-    law = f"{FLOOR} + {1.0 - FLOOR} * inp0^{PENALTY:g}"
-    solver = None
-    if d == 3:
-        inner = pym.solvers.GeometricMultigrid(grid(2))
-        outer = pym.solvers.GeometricMultigrid(domain, inner_level=inner)
-        solver = pym.solvers.CG(preconditioner=outer)
-    network = pym.Network(
-        pym.MathGeneral(density, stiff, expression=law),
-        pym.AssembleStiffness(stiff, matrix, **options),
-        pym.LinSolve([matrix, load], u, solver=solver),
-        pym.EinSum([u, load], compliance, expression="i,i->"),
-    )
-
-    def iterate(x: np.ndarray) -> tuple[float, np.ndarray]:
-        network.reset()
-        density.state = x
-        network.response()
-        compliance.sensitivity = 1.0
-        network.sensitivity()
-        return float(compliance.state), np.asarray(density.sensitivity)
 
     return iterate
 

@@ -1,4 +1,4 @@
-"""Seconds and memory of a design iteration of one solid link, beside DOLFINx and pyMOTO."""
+"""Seconds and memory of a design iteration of one solid link, beside DOLFINx."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, field_tolerance
-from dolfinopt.bench.iterations import plain_statics, pymoto_iteration
+from dolfinopt.bench.iterations import plain_statics
 from dolfinopt.bench.measure import Plan, in_processes, mpirun
 from dolfinopt.bench.panel import Diagram, Rows, Steps
 from dolfinopt.fem.multigrid import MultigridSolver
@@ -30,7 +30,7 @@ CELLS = (90, 9, 6), (120, 12, 8), (180, 18, 12), (260, 26, 17), (310, 31, 20), (
 QUICK = (40, 4, 3), (60, 6, 4)
 OURS = COLD, WARM = "dolfinopt, first design", "dolfinopt, nearby design"
 PLAIN = "plain DOLFINx, one load"
-STATIC, PYMOTO = "dolfinopt, one load", "pyMOTO, one load"
+STATIC = "dolfinopt, one load"
 DESIGNS = FIRST, NEARBY = "first design", "nearby design"
 STATIC_CELLS = (64, 8, 8), (112, 16, 12), (156, 20, 16)  # that three grids divide
 LOAD = 0.0, 1.0, 0.0, 0.0, 0.0, 0.0  # N across the end
@@ -99,21 +99,6 @@ def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
     return nodal_dofs(cells), MultigridSolver.name, [_seconds(comm, plain, box_beam(arm.centroid))]
 
 
-def pymoto_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool) -> Found | None:
-    """Return the same by pyMOTO, None where it is not installed."""
-    iterate = pymoto_iteration(link_scene(scene, cells, static), cells)
-    if iterate is None:
-        return None
-    # Its cells run along first, then up the height.
-    places = np.indices(cells).reshape(3, -1, order="F").T + 0.5
-    centroid = places / cells * SIZE - [0.0, 0.5 * HEIGHT, 0.5 * THICKNESS]
-    return (
-        nodal_dofs(cells),
-        MultigridSolver.name,
-        [_seconds(comm, iterate, x) for x in two_designs(centroid)],
-    )
-
-
 def nodal_dofs(cells: Cells) -> int:
     """Return the degrees of freedom of all nodes."""
     return 3 * math.prod(n + 1 for n in cells)
@@ -127,17 +112,13 @@ def two_designs(centroid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _statics(plan: Plan) -> Steps:
-    def rows(name: str, cells: Cells) -> Rows:
-        link = iterate_link if name == STATIC else pymoto_link
-        result, memory = in_processes(link, plan.scene, cells, True, ranks=1)
-        if result is not None:
-            dofs, solver, found = result
-            for design, seconds in zip(DESIGNS, found, strict=True):
-                yield name, design, dofs, seconds, memory * 2**20 / 1e9, solver
+    def rows(cells: Cells) -> Rows:
+        (dofs, solver, found), memory = in_processes(iterate_link, plan.scene, cells, True, ranks=1)
+        for design, seconds in zip(DESIGNS, found, strict=True):
+            yield STATIC, design, dofs, seconds, memory * 2**20 / 1e9, solver
 
     for cells in STATIC_CELLS[: 1 if plan.quick else None]:
-        for name in (STATIC, PYMOTO):
-            yield f"{name}, {' x '.join(map(str, cells))} cells", partial(rows, name, cells)
+        yield f"{STATIC}, {' x '.join(map(str, cells))} cells", partial(rows, cells)
 
 
 def _links(plan: Plan) -> Steps:
@@ -179,7 +160,6 @@ STATICS = Diagram(
     ("iteration [s]", "memory [GB]"),
     "program",
     "CPU seconds on one rank of compliance under one load across the end and its gradient; a box "
-    f"beam, then densities moved by up to {MOVE:g}. pyMOTO: conjugate gradients with three "
-    "geometric grids; the loaded end is not rigid there.",
+    f"beam, then densities moved by up to {MOVE:g}.",
     each=("design",),
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bodies import random_cloud, stiffened
 from mpi4py import MPI
-from readers import check_npz, mbdyn_forces, mbdyn_stiffening, random_state, read_as_mbdyn_does
+from readers import mbdyn_forces, mbdyn_stiffening, random_state, read_as_mbdyn_does
 from remainders import substructure
 from runs import TWO_ARM, tomllib
 
@@ -23,7 +23,6 @@ from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.body import BodyMotion, Constants
 from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.reduction import Options, craig_bampton
-from dolfinopt.scene.sid import read_sid, sid_text
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.02  # m
@@ -223,19 +222,6 @@ def test_second_moments_converge():
     assert np.max(errors[-1]) < 0.01
 
 
-def test_nodes_of_an_arm_on_several_ranks(parts):
-    """Shared by all ranks, an arm has the same nodes and masses; the modes agree to rounding."""
-    _, _, nodes = reduced((8, 3), COMM, uneven=True)
-    if COMM.rank != 0:
-        assert nodes is None
-        return
-    alone = parts[2]
-    np.testing.assert_allclose(nodes.points, alone.points, atol=1e-12)
-    np.testing.assert_allclose(nodes.masses, alone.masses, rtol=1e-12)
-    # Eigenvectors are right to 1e-10.
-    np.testing.assert_allclose(nodes.modes, alone.modes, atol=1e-8 * np.abs(alone.modes).max())
-
-
 SMALL = ["--set", "arms.cells=[20,3]", "--set", "arms.arm2.length=0.8"]
 
 
@@ -243,26 +229,6 @@ def export(folder, *arguments, world=COMM):
     command = ["export", TWO_ARM, *SMALL, *arguments, "--out", folder]
     commands.main([str(word) for word in command], standalone_mode=False, obj=world)
     world.barrier()
-
-
-def test_export_writes_every_arm(shared_tmp_path):
-    export(shared_tmp_path / "out")
-    names = {f"{arm}{kind}" for arm in ("arm1", "arm2") for kind in (".sid", ".sid.npz", ".fem")}
-    assert set(os.listdir(shared_tmp_path / "out")) == names
-    for arm, length in (("arm1", 1.0), ("arm2", 0.8)):
-        path = shared_tmp_path / "out" / f"{arm}.sid"
-        body = load_body(path, 2, length)
-        assert body.num_modes == 4
-        # Half solid 0.06 m x 0.01 m of aluminium, and void of 1e-6 of it.
-        expected = 2700.0 * length * 0.06 * 0.01 * (0.5 + 0.5e-6)
-        assert body.mass == pytest.approx(expected, rel=1e-9)
-        data = read_sid(path)
-        check_npz(path.with_name(f"{arm}.sid.npz"), data)
-        assert path.read_text() == sid_text(data)
-        groups = read_as_mbdyn_does(path.with_suffix(".fem").read_text())
-        assert np.array_equal(groups[10], body.K) and np.array_equal(groups[9], body.M)
-        assert groups[12][0] == body.mass and len(groups[2]) == 21 * 4 + 2
-        assert [groups[5][1], groups[6][1]] == list(body.outboard_point)
 
 
 @pytest.mark.parametrize(

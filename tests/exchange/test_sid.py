@@ -361,15 +361,6 @@ def test_files_of_every_link(folder):
         assert [node.name for node in data.nodes] == ["1", "2"]
 
 
-@pytest.mark.skipif(COMM.size == 1, reason="one rank")
-def test_files_are_the_same_on_any_number_of_ranks(folder, shared_tmp_path):
-    if COMM.rank == 0:
-        run("export", DEMO, *COARSE, *SETTINGS, "--out", shared_tmp_path, world=MPI.COMM_SELF)
-        for path in shared_tmp_path.iterdir():
-            if path.suffix != ".npz":  # archives hold the time of day
-                assert path.read_bytes() == (folder[0] / path.name).read_bytes(), path.name
-
-
 def meshed():
     """Return the demo as a dictionary, coarse and short, every arm with all of its keys."""
     scene = tomllib.loads(DEMO.read_text())

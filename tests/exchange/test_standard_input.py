@@ -9,18 +9,15 @@ import pytest
 from bodies import beam, random_cloud, random_tree
 from bodies import stiffened as bent
 from readers import State, forces_of_sid, random_state
-from remainders import substructure
 from runs import refused
 
-from dolfinopt.exchange.in_space import in_space, plate_moments
+from dolfinopt.exchange.in_space import in_space
 from dolfinopt.exchange.standard_input import from_sid, load_body, to_sid
-from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.body import BodyMotion, Constants
 from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals, shape_integrals
-from dolfinopt.reduction import Options, craig_bampton
+from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
 from dolfinopt.scene.sid import (
     StandardInputData,
     Taylor,
@@ -90,22 +87,6 @@ def test_round_trip(tmp_path, dimension, q):
     assert again.comment == "a cloud" and len(again.names) == q
 
 
-@pytest.mark.parametrize("q", [1, 4])
-@PLANE_AND_SPACE
-def test_round_trip_of_geometric_stiffness(tmp_path, dimension, q):
-    """To rounding: Oe, Cr hold K0 in a sum; in space all but its sum with the inertia's moments."""
-    body = stiffened(body_of(dimension, q, q), q)
-    write_sid(tmp_path / "a.sid", sid_of(body))
-    again = load_body(tmp_path / "a.sid", dimension)
-    scale = float(max(np.abs(body.M).max(), np.abs(body.K0).max()))
-    if dimension == 2:
-        assert_close(again.K0, body.K0, size=scale)
-    assert_close(again.M, body.M)
-    assert np.array_equal(again.K0_outboard, body.K0_outboard)
-    told_apart = {"K0": body.K0, "W": body.W} if dimension == 3 else {"K0": body.K0}
-    same(replace(again, **told_apart), body)
-
-
 @STIFF
 def test_body_of_a_file_in_a_machine(tmp_path, stiff):
     """The same inverse dynamics, though inertia and stiffness are told apart by a guess."""
@@ -124,18 +105,6 @@ def test_body_of_a_file_in_a_machine(tmp_path, stiff):
     assert again.is_stiffened == stiff
     for found, expected in zip(forces(again), forces(body), strict=True):
         assert_close(found, expected)
-
-
-def test_stiffness_of_a_slender_link_is_told_from_its_mass():
-    """Loads that act across the link at places across it are none: the split is exact then."""
-    rng = np.random.default_rng(4)
-    body = stiffened(random_cloud(rng, 4, 3).body(), 4)
-    K0 = body.K0.copy()
-    K0[[4, 5, 7, 8, 10, 11]] = 0.0  # A_ab with b = y, z: the columns xy, xz, yy, yz, zy, zz
-    body = replace(body, K0=K0)
-    again = from_sid(to_sid(body), 3)
-    assert_close(again.K0, body.K0)
-    assert_close(again.W, body.W)
 
 
 @STIFF
@@ -203,38 +172,6 @@ def test_outboard_node(dimension, stiff):
     small = 1e-7 * s.q
     turned = Interface(moving(body, replace(s, q=small))).turning.R[:, :, 0]
     assert np.abs(tip.AP.at(small) - turned).max() < 1e-13
-
-
-@pytest.fixture(scope="module")
-def arm():
-    arm = substructure((1.2, 0.3, THICKNESS), (10, 3))
-    place = np.round(arm.mesh.centroid, 9)
-    x = 0.5 + 0.49 * np.sin(300.0 * place[:, 0] + 1700.0 * place[:, 1])
-    elastic = arm.at(70e9 * x**3, 2700.0 * x)
-    return elastic, craig_bampton(elastic, Options(5))
-
-
-def planar_parts(body):
-    """J, int X . Phi, int S X . Phi, M and geometric stiffness."""
-    return body.W[0, 0, 0], body.W[0, 0, 1:], body.W[1, 1:, 0], body.M, body.K0, body.K0_outboard
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_moments_of_an_arm_agree_with_its_planar_integrals(tmp_path, arm, known):
-    """In the plane the file holds the arm's own integrals, whatever stands out of it."""
-    elastic, basis = arm
-    body = shape_integrals(elastic, basis, 2e-4, unit_loads(elastic))
-    lifted = in_space(body, plate_moments(elastic, basis, THICKNESS) if known else None)
-    write_sid(tmp_path / "arm.sid", to_sid(lifted))
-    again = load_body(tmp_path / "arm.sid", 2, length=1.2)
-    for found, expected in zip(planar_parts(again), planar_parts(body), strict=True):
-        assert_close(found, expected, size=float(np.abs(expected).max()))
-    assert_close(again.W[1, 1:, 1:], body.W[1, 1:, 1:], size=float(np.abs(body.M).max()))
-    for name in ("mass", "w", "K", "D", "outboard", "outboard_point"):
-        assert np.array_equal(getattr(again, name), getattr(body, name)), name
-    assert np.array_equal(lifted.M, lifted.M.T)
-    depth = body.mass * THICKNESS**2 / 12.0 if known else 0.0
-    assert lifted.W[8, 0, 0] == pytest.approx(depth, rel=1e-14)
 
 
 def swap(data, name, which="M0", **entries):

@@ -5,19 +5,15 @@ import json
 import numpy as np
 import pandas as pd
 import pytest
-from mpi4py import MPI
 from pages import Reader
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
 from runs import ROOT, refusal, run, summary_of
-from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_scene
 
-from dolfinopt.arms.arm import Arm
-from dolfinopt.cli.exchange import _check_robot, link_inertia
+from dolfinopt.cli.exchange import _check_robot
 from dolfinopt.exchange.urdf.file import NewLink, implausible_inertias, read_robot, robot_text
 from dolfinopt.exchange.urdf.robot import Inertia, Robot, default_tool, scene_bodies
 from dolfinopt.exchange.urdf.scene import read_origin
 from dolfinopt.plots.style import new_figure
-from dolfinopt.profiling import Profile
 from dolfinopt.scene.schema import file_digest
 from dolfinopt.study.before_after import before_after
 
@@ -87,22 +83,6 @@ def test_new_meshes_take_the_place_of_all_shapes(tmp_path):
     assert inside.count("<visual>") == inside.count("<collision>") == 1
     assert '<material name="grey"/>' in inside and "box" not in inside
     refusal(lambda: robot_text(file, [NewLink("arm", body)], folder), "no link 'arm'")
-
-
-def test_a_links_inertia_is_its_bodys_and_its_motors():
-    """Against parallel axes by hand: a box, and a motor at its outboard end."""
-    scene = solid_scene(cells=(10, 3, 2), joint_mass=0.7, joint_inertia=0.01)
-    arm = Arm(scene, 0, MPI.COMM_SELF, Profile())
-    found = link_inertia(scene, 0, arm.reduce(np.ones(60)))
-    box = DENSITY * LENGTH * HEIGHT * THICKNESS
-    mass = box + 0.7
-    centre = (0.5 * box * LENGTH + 0.7 * LENGTH) / mass
-    squares = np.array([HEIGHT**2 + THICKNESS**2, LENGTH**2 + THICKNESS**2, LENGTH**2 + HEIGHT**2])
-    apart = box * (centre - 0.5 * LENGTH) ** 2 + 0.7 * (LENGTH - centre) ** 2
-    expected = np.diag(box * squares / 12.0 + 0.01 + [0.0, apart, apart])
-    assert found.mass == pytest.approx(mass, rel=1e-13)
-    assert found.centre == pytest.approx([centre, 0.0, 0.0], abs=1e-14)
-    assert np.abs(found.tensor - expected).max() < 1e-13
 
 
 def test_export_says_what_it_cannot_write(tmp_path):

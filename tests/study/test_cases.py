@@ -1,7 +1,6 @@
 """Cases: known by what they compute, done once, resumed, and the same on any number of ranks."""
 
 import logging
-import shutil
 
 import numpy as np
 import pytest
@@ -230,21 +229,6 @@ def test_chosen_coordinates_are_those_of_each_scene():
 
 
 @alone
-def test_growing_study_computes_the_new_cases_alone(plan, done, tmp_path, simulated):
-    """What is there stays as it is, and all are the same in any company."""
-    _, outcomes = done
-    [case, *_] = together = plan[3:6]
-    first = run_cases([case], tmp_path, SELF, shown=False)
-    kept = first[case].design.stat().st_mtime_ns
-    after = run_cases(together, tmp_path, SELF, shown=False)
-    assert len(simulated) == 3 and after.computed == 2
-    assert after[case].design.stat().st_mtime_ns == kept
-    assert after[case].compliance == first[case].compliance
-    for one in together:
-        assert_close(after[one], outcomes[one])
-
-
-@alone
 def test_simulations_that_are_not_kept_have_the_same_figures(plan, done, tmp_path):
     """Two files in place of five, the same figures; all files once they are to be kept."""
     _, outcomes = done
@@ -257,21 +241,6 @@ def test_simulations_that_are_not_kept_have_the_same_figures(plan, done, tmp_pat
     kept = run_cases([case], tmp_path, SELF, shown=False)
     assert kept.computed == 1 and kept[case].design.exists()
     assert run_cases([case], tmp_path, SELF, shown=False, keep=False).computed == 0
-
-
-@alone
-def test_damaged_summary_is_done_anew(plan, done, tmp_path):
-    """As are its other files; what a killed run has left is removed."""
-    folder, outcomes = done
-    case = plan[3]
-    shutil.copytree(folder / "cases", tmp_path / "cases")
-    (tmp_path / "cases" / case.key / "summary.json").write_text('{"seconds": {')
-    left = tmp_path / ".work-0123"
-    left.mkdir()
-    (left / f"{case.key}.taken").touch()
-    again = run_cases(plan, tmp_path, SELF, shown=False)
-    assert again.computed == 1 and {path.name for path in tmp_path.iterdir()} == {"cases"}
-    assert_close(again[case], outcomes[case])
 
 
 @alone

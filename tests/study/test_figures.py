@@ -13,7 +13,7 @@ from pictures import TOLERANCE, difference
 
 from dolfinopt.plots.style import BLUE, LONGEST, ORANGE, look, look_numbers, shortened, spread
 from dolfinopt.study.figures import common_looks, draw, line_figure
-from dolfinopt.study.tables import FrameFigure, Line, LineFigure, Panel, Study, Table, write_study
+from dolfinopt.study.tables import FrameFigure, Line, LineFigure, Panel, Table
 
 PICTURE = Path(__file__).parent / "sweep.png"  # written by `bare`, then looked at
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -174,16 +174,3 @@ def test_a_table_and_curves_as_text():
                     ["p", "a", "2", "4"], ["p", "b", "1", "3"], ["p", "b", "2", ""]]  # fmt: skip
     both = LineFigure("", "", panels).csv()
     assert both.splitlines()[0] == "panel,line,x,y" and len(both.splitlines()) == 7
-
-
-def test_files(tmp_path):
-    one = Table("", "First.", pd.DataFrame({"a": [1]}))
-    other = Table("more", "Second.", pd.DataFrame({"b": [2.5]}))
-    line = Line("l", np.array([0.0]), np.array([1.0]))
-    figure = LineFigure("f", "", (Panel("", "x [s]", "y [m]", (line,)),))
-    study = Study("name", (one, other), (figure,), (), 0)
-    write_study(study, tmp_path)
-    files = {path.name: path.read_text() for path in tmp_path.iterdir()}
-    assert set(files) == {"name.csv", "name_more.csv", "name.md", "name_f_curves.csv"}
-    assert files["name_more.csv"] == "b\n2.5\n"
-    assert files["name.md"] == one.markdown() + "\n" + other.markdown()

@@ -5,7 +5,7 @@ import pytest
 from mpi4py import MPI
 from runs import TWO_ARM, by_root, overrides, refusal
 from runs import run as run_command
-from studies import COARSE, cells_of, column, rows_of, write_uniform
+from studies import COARSE, column, rows_of, write_uniform
 
 import dolfinopt as do
 from dolfinopt.errors import ConvergenceError
@@ -138,28 +138,6 @@ def test_what_is_known_is_not_done_again(chunks, given, shared_tmp_path):
     assert respond(payloads(few, design=given), shared_tmp_path)[1] == CHUNK
 
 
-@alone
-def test_an_interruption_costs_a_chunk(chunks, tmp_path, monkeypatch):
-    """Ctrl-C in the third chunk: two are kept, and the end is the same."""
-    count = 3 * CHUNK - 1
-    honest, calls = computing.simulate_all, []
-
-    def interrupted(scenes, *others):
-        calls.append(1)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        return honest(scenes, *others)
-
-    monkeypatch.setattr(computing, "simulate_all", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        respond(payloads(count), tmp_path / "a", SELF)
-    (found, again, _), (expected, all_of_it, _) = (
-        respond(payloads(count), tmp_path / name, SELF) for name in ("a", "b")
-    )
-    assert (again, all_of_it) == (CHUNK, 3 * CHUNK)
-    np.testing.assert_array_equal(found, expected)
-
-
 @pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
 def test_ranks_do_not_matter(chunks, given, tmp_path, shared_tmp_path):
     """The same bits, whoever does a chunk, of two designs."""
@@ -249,33 +227,6 @@ def study(given, folder, *random, base=None, **options):
 
 def tables_of(done):
     return {table.name: table for table in done.tables}
-
-
-@alone
-def test_small_scatter_is_linear(folder, given):
-    """The standard deviation is that of the linearised model, by central differences."""
-    fine = "simulation.tolerance=1e-4"
-    spread = {"payload.mass": 0.01, "material.young_modulus": 1e8, "arms.thickness": 1e-5}
-    centre = {"payload.mass": 6.0, "material.young_modulus": 70e9, "arms.thickness": 0.01}
-    texts = [f"{key}=normal:{centre[key]!r}:{s!r}" for key, s in spread.items()]
-    done = study(given, folder, *texts, base=scene(fine), samples=64)
-    found = {row[:2]: row[2] for row in cells_of(tables_of(done)["statistics"])}
-
-    def at(key, value):
-        one = evaluated(fine, f"{key}={value!r}", density=1.0)
-        return np.array([one.compliance, 1e3 * one.max_deviation])
-
-    parts = [0.5 * (at(key, centre[key] + s) - at(key, centre[key] - s))
-             for key, s in spread.items()]  # fmt: skip
-    expected = np.sqrt(np.sum(np.square(parts), axis=0))
-    shares = np.square(parts) / np.sum(np.square(parts), axis=0)
-    for j, quantity in enumerate(("compliance [N m]", "maximal deviation [mm]")):
-        # 64 net points give a normal law's standard deviation to some 2 %.
-        assert found[quantity, "standard deviation"] == pytest.approx(expected[j], rel=0.04)
-        name = quantity.partition(" [")[0]
-        rows = [row for row in cells_of(tables_of(done)["indices"]) if row[1] == name]
-        # The polynomial knows the distributions themselves.
-        np.testing.assert_allclose([row[3] for row in rows], shares[:, j], atol=0.01)
 
 
 def test_one_input_has_no_indices(folder, given):
