@@ -11,7 +11,7 @@ from runs import TWO_ARM, refusal, refused, run
 from dolfinopt.bench import accuracy, field, iterations, measure, panel, solid
 from dolfinopt.bench import run as benches
 from dolfinopt.bench.measure import Plan
-from dolfinopt.bench.panel import Diagram, Frame, curves, figure_of, fitted_power, least_x
+from dolfinopt.bench.panel import Diagram, Frame, figure_of, fitted_power, least_x
 from dolfinopt.bench.run import Goal, goal_table
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.exchange.urdf.file import read_robot
@@ -113,13 +113,6 @@ def test_source_is_what_the_files_hold(tmp_path):
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_cut_off_file_is_measured_anew(measured, tmp_path):
-    (tmp_path / "toy.json").write_text('{"stamp": [')
-    measured(toy(lambda step: [("a", 1.0, 1.0)]))
-    assert "a,1,1" in (tmp_path / "toy.csv").read_text()
-
-
-@pytest.mark.usefixtures("no_pictures")
 def test_failure_is_told_and_tried_again(measured, tmp_path):
     """Other steps and diagrams are measured all the same, and there is a summary."""
     calls = []
@@ -136,16 +129,6 @@ def test_failure_is_told_and_tried_again(measured, tmp_path):
     assert "no ranks" in (tmp_path / "bench.md").read_text()
     assert measured(toy(measure), late)[0] == [] and calls == [0, 1, 0]
     assert "no ranks" not in (tmp_path / "bench.md").read_text()
-
-
-def test_diagram_of_which_nothing_was_measured_is_told(measured, tmp_path):
-    def fails(step):
-        raise ConvergenceError("no program")
-
-    failures, _ = measured(toy(fails))
-    assert failures and all("no program" in one for one in failures)
-    assert "no program" in (tmp_path / "bench.md").read_text()
-    assert not (tmp_path / "toy.png").exists()
 
 
 def test_ended_bench_keeps_what_is_finished(measured, monkeypatch, tmp_path):
@@ -194,12 +177,6 @@ def test_ranks_need_no_settings(monkeypatch):
 
 def points(*rows, columns="name seconds error"):
     return Frame(rows, columns=columns.split())
-
-
-def test_curves_leave_out_what_a_logarithm_cannot_show():
-    frame = points(("a", 1.0, 2.0), ("a", 2.0, 0.0), ("b", 1.0, math.nan))
-    found = curves(frame, "seconds", "error", "name")
-    assert [*found] == ["a"] and found["a"].values.tolist() == [[1.0, 2.0]]
 
 
 def test_fitted_power():

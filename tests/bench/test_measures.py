@@ -40,31 +40,6 @@ def reference(problem):
 # -- motion ----------------------------------------------------------------------------------
 
 
-def test_accelerations_solve_the_residual(problem):
-    size = problem.mechanism.num_coordinates
-    rng = np.random.default_rng(1)
-    q, qd = 1e-3 * rng.normal(size=size), 1e-2 * rng.normal(size=size)
-    qdd = accuracy.accelerations(problem, 0.7, q, qd)
-    now = problem.at(np.array([0.7]))
-    left, at_rest = (now.residual(q[None], qd[None], rate[None]) for rate in (qdd, 0 * qdd))
-    assert np.abs(left).max() < 1e-11 * np.abs(at_rest).max()
-
-
-def test_jacobian_is_the_derivative_of_accelerations(problem):
-    problem = problem.preconditioner().system
-    size = problem.mechanism.num_coordinates
-    rng = np.random.default_rng(2)
-    y, d = 1e-3 * rng.normal(size=2 * size), rng.normal(size=2 * size)
-    exact = accuracy.jacobian(problem, 0.7, y) @ d
-
-    def rate(step):
-        q, qd = np.split(y + step * d, 2)
-        return np.concatenate([qd, accuracy.accelerations(problem, 0.7, q, qd)])
-
-    central = (rate(1e-5) - rate(-1e-5)) / 2e-5
-    np.testing.assert_allclose(central, exact, rtol=1e-6, atol=1e-6 * np.abs(exact).max())
-
-
 def test_scipy_and_radau_agree(problem, reference):
     """Two independent paths through the same residual; the errors fall with the tolerance."""
 

@@ -409,21 +409,6 @@ def test_without_petsc_one_line_says_how_to_get_it(tmp_path):
     assert not (tmp_path / "o").exists()
 
 
-@pytest.mark.serial
-@pytest.mark.parametrize("stiffening", ["false", "true"])
-def test_arm_of_a_file_without_geometric_stiffness(tmp_path, capsys, stiffening):
-    """A scene that asks for it hears that the file has none; a file that has it is no news."""
-    small = overrides("arms.cells=[20,3]", f"simulation.stiffening={stiffening}")
-    run("export", TWO_ARM, *small, "--out", tmp_path / "bodies")
-    arm2 = f'name = "arm2"\nsid = "{tmp_path}/bodies/arm2.sid"'
-    (tmp_path / "scene.toml").write_text(TWO_ARM.read_text().replace('name = "arm2"', arm2))
-    asked = overrides("arms.arm1.cells=[20,3]", "simulation.stiffening=true")
-    capsys.readouterr()
-    run("export", tmp_path / "scene.toml", *asked, "--out", tmp_path / "out")
-    told = capsys.readouterr().err
-    assert ("arm2.sid holds no geometric stiffness" in told) == (stiffening == "false")
-
-
 # -- what is shown while an optimisation runs, and the time it says to have taken  ----------------
 
 
@@ -444,13 +429,6 @@ def test_lines_without_a_terminal(capsys):
     assert text.count("7/400 objective 2.5 dev 7.5 mm") >= 2
     time.sleep(0.1)
     assert capsys.readouterr().err.count("\n") <= 1  # it ends with the run
-
-
-@pytest.mark.serial
-def test_a_short_run_says_nothing(capsys):
-    with progress(MPI.COMM_SELF, every=60.0) as say:
-        say("1/10")
-    assert capsys.readouterr().err == ""
 
 
 # -- the commands on controlled machines and closed loops  ----------------------------------------
@@ -518,12 +496,6 @@ def test_state_space_of_a_run_and_of_a_scene(shared_tmp_path, capsys, write_scen
         line = ["export", *words, "--out", shared_tmp_path / "none"]
         refusal(lambda line=line: run(*line), expected)
     assert not (shared_tmp_path / "none").exists()
-
-
-def test_bodies_of_a_loop_are_exported(shared_tmp_path, write_scene):
-    run("export", write_scene(loop("pin")), "--out", shared_tmp_path / "bodies")
-    arms, kinds = ("coupler", "rocker"), (".sid", ".sid.npz", ".fem")
-    assert set(contents(shared_tmp_path / "bodies")) == {a + kind for a in arms for kind in kinds}
 
 
 @pytest.mark.slow

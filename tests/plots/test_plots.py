@@ -119,23 +119,6 @@ def test_ticks_and_marks_are_round_and_inside():
         assert largest <= marks[-1] * (1.0 + 1e-9) and marks[-1] <= max(1.6 * largest, 1.0)
 
 
-def test_log_scale_beyond_a_decade():
-    for values, log in (((28.0, 2.5), True), ((55.0, 7.0), False), ((1.0, 0.0), False)):
-        assert style.spans_decade(np.array(values)) is log
-    for values in ((0.067, 0.17), (2.8, 28.0), (1e-6, 1.0)):
-        axes = style.new_figure(4.0, 2.0).add_subplot()
-        axes.plot(values)
-        style.log_scale(axes, np.array(values))
-        low, high = axes.get_ylim()
-        assert 2 <= sum(low <= tick <= high for tick in axes.get_yticks()) <= 8
-
-
-def test_volume_fraction_of_any_polygons():
-    corners = np.array([[[0, 0], [0, 1], [3, 1], [3, 0]], [[3, 0], [4, 0], [4, 1], [3, 1]]], float)
-    view = ArmView("a", corners, corners.mean(axis=1), np.array([1.0, 0.2]), np.zeros((2, 4, 2, 0)))
-    assert design.volume_fraction(view) == pytest.approx(0.8)  # the first one is clockwise
-
-
 @pytest.mark.parametrize("arms", [1, 6])
 @pytest.mark.parametrize("tall", [0.06, 1.2])
 def test_axes_below_each_other_have_one_scale(arms, tall):

@@ -85,7 +85,6 @@ BAD = [
     ([*SWEEP, "tides"], "tides"),
     ([*SWEEP, "--vary", "payload.mas=1,2"], "payload.mass"),
     ([*SWEEP, "--vary", "payload.mass=a,b"], "expected"),
-    ([*SWEEP, "--vary", "payload.mass=-1:1:3"], "payload.mass = -1"),
     ([*SWEEP, "--vary", "reduction.coordinates=4,4.5"], "integer"),
     ([*SWEEP, "--vary", "payload.mass=1,2", "--vary", "payload.mass=3,4"], "twice"),
     ([*SWEEP, "--vary", "motion.radius=1,5"], "from the shoulder"),
@@ -95,41 +94,30 @@ BAD = [
     ([*SWEEP, "--vary", "arms.arm2.length=0.9,1"], "--reoptimize"),  # of another size
     ([*SWEEP, "coordinates", "--vary", "payload.mass=1,2"], "only"),
     ([*SWEEP, "coordinates", "--vary", "reduction.coordinates=4,4.5"], "whole"),
-    ([*SWEEP, "coordinates", "--vary", "reduction.coordinates=100000"], "100000"),
     ([*SWEEP, "--design", "a.npz", "b.npz"], "b.npz"),  # a file that looks like a preset
     ([*SWEEP, "coordinates", "--reoptimize"], "compare reductions"),
     (["compare", TWO_ARM, "designs"], "objectives"),
     ([*OBJECTIVES, "--design", "a.npz"], "--design", "makes its own"),
     ([*OBJECTIVES, "joy"], 'objective.kind = "joy"'),
     ([*OBJECTIVES, "mass"], "a limit under"),
-    ([*REDUCTIONS, "100000"], "100000"),
     ([*REDUCTIONS, "esl"], "esl"),
     ([*SECTIONS, "esl"], "esl: expected nothing behind"),
-    ([*SECTIONS, "--design", "nowhere.npz"], "nowhere.npz", "no such file"),
     ([*SECTIONS, "--design", "a.npz", "--design", "b.npz"], "one file"),
     (["reproduce", "--set", "payload.mas=4"], "payload.mass"),
-    (["reproduce", "--set", "motion.radius=5"], "motion.radius"),
     ([*RANDOM], "--random"),
     ([*RANDOM, "--random", "payload.mass"], "KEY=DISTRIBUTION"),
     ([*RANDOM, "--random", "payload.mass=cauchy:6:1"], "one of normal"),
     ([*RANDOM, "--random", "payload.mass=normal:6"], "normal:MEAN:DEVIATION"),
-    ([*RANDOM, "--random", "payload.mas=normal:6:1"], "payload.mass"),
-    ([*RANDOM, "--random", "arms.leg.thickness=normal:6:1"], "arm1"),
-    ([*RANDOM, "--random", "payload=normal:6:1"], "a table"),
     ([*RANDOM, "--random", "reduction.coordinates=normal:4.2:1"], "an integer"),
     ([*RANDOM, "--random", "motion.elbow=uniform:0:1"], "motion.elbow"),  # a choice
-    ([*RANDOM, "--random", "motion.gravity=normal:0:1"], "motion.gravity"),  # an array
     ([*RANDOM, "--random", "motion.flattening=normal:2:0.1"], "<= 1"),  # median out of range
     ([*RANDOM, "--random", "motion.flattening=uniform:0.9:1.1"], ">= 0 and <= 1"),
     ([*RANDOM, "--random", "payload.mass=normal:-1:2"], "payload.mass = -1"),  # half of it beyond
     ([*RANDOM, "--random", "design.initial=uniform:0.4:0.6"], "given design"),  # of the optimiser
-    ([*RANDOM, "--random", "simulation.sample=uniform:1e-3:2e-3"], "given design"),
     ([*RANDOM, "--random", "arms.arm2.length=normal:1:0.01"], "another length"),
     ([*RANDOM, "--random", MASS, "--random", "payload.mass=uniform:1:2"], "twice"),
-    ([*RANDOM, "--random", "motion.radius=normal:1:1"], "from the shoulder"),
     ([*RANDOM, "--random", MASS, "--samples", "5"], "at least 10"),
     ([*RANDOM, "--random", MASS, "--seed", "-1"], "--seed -1"),
-    ([*RANDOM, "--random", MASS, "--design", "nowhere.npz"], "nowhere.npz"),
 ]
 
 
