@@ -201,27 +201,6 @@ def test_first_moments_are_exact(name):
     )
 
 
-def test_second_moments_converge():
-    """What is quadratic in them is right to the square of the cells' size."""
-    errors = []
-    for n in (1, 2, 4):
-        body, lifted, nodes = reduced((8 * n, 2 * n))
-        found = invariants(modal_element(lifted, nodes))
-        errors.append(
-            [
-                abs(found["J"][2, 2] / body.W[0, 0, 0] - 1.0),
-                np.abs(found["Inv4"][2] - body.W[1, 1:, 0]).max() / np.abs(body.W[1, 1:, 0]).max(),
-                np.abs(found["Inv5"][2].T - body.W[1, 1:, 1:]).max()
-                / np.abs(body.W[1, 1:, 1:]).max(),
-                np.abs(found["M"] - body.M).max() / np.abs(body.M).max(),
-            ]
-        )
-    rates = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    # Measured: 1.93 to 2.03.
-    assert rates[-1].min() > 1.8 and rates[-1].max() < 2.2, rates
-    assert np.max(errors[-1]) < 0.01
-
-
 SMALL = ["--set", "arms.cells=[20,3]", "--set", "arms.arm2.length=0.8"]
 
 

@@ -12,7 +12,6 @@ from machines import GAINS, controlled, loop
 from matplotlib.collections import PathCollection
 from mpi4py import MPI
 from PIL import Image
-from runs import ROOT
 
 import dolfinopt as do
 from dolfinopt.multibody.closures import Along, Loops, Tie
@@ -421,24 +420,3 @@ def test_drives_have_a_row_each_and_the_ground_one():
     assert titles["pin"] == ["crank: moment [N m]", "force of the pin on the arm [N]"]
     # A cart that follows the desired motion exactly has no error to be shown.
     assert titles["soft"][0] == "cart: force [N]" and len(titles["soft"]) == 5
-
-
-@pytest.mark.parametrize("slides", [(), (0,), (1,), (0, 2)])
-def test_units_of_drives_in_space(slides):
-    """They follow the joints' kinds; the first joint of a tree is no cart."""
-    scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml")
-    kinds = ["prismatic" if k in slides else one.type for k, one in enumerate(scene.movable)]
-    count = len(kinds)
-    assert count == 3
-    joints = [one.unchecked_copy({"type": t}) for one, t in zip(scene.movable, kinds)]
-    control = SimpleNamespace(stiffness=(1.0,) * count, damping=(1.0,) * count)
-    scene = scene.unchecked_copy({"joints": (*joints,), "control": control})
-    zero = np.zeros((4, count))
-    trajectory = SimpleNamespace(
-        scene=scene, q_r=zero, desired=SimpleNamespace(q=zero), joint_forces=zero,
-        closure_force=None,
-    )  # fmt: skip
-    panels = [(label.split(": ")[1], unit) for row in curves.drive_panels(trajectory)
-              for label, unit, _ in row]  # fmt: skip
-    of = {True: [("error", "m"), ("force", "N")], False: [("error", "rad"), ("moment", "N m")]}
-    assert panels == [quantity for k in range(count) for quantity in of[k in slides]]
