@@ -20,7 +20,7 @@ from dolfinopt.parallel import Partition, gather_cells, on_root, together
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.schema import DIGEST, program, with_digests
+from dolfinopt.scene.schema import DIGEST, flattened, program, with_digests
 from dolfinopt.solver import user_options
 
 if TYPE_CHECKING:
@@ -194,28 +194,17 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _difference(theirs: Any, ours: Any, key: str = "") -> str:
-    """Describe the first difference between two scenes; empty when they compute the same."""
-    if isinstance(theirs, dict) and isinstance(ours, dict):
-        for name in [*ours, *(k for k in theirs if k not in ours)]:
-            path = f"{key}.{name}" if key else name
-            if path in MAY_CHANGE:
-                continue
-            result = _difference(theirs.get(name), ours.get(name), path)
-            if result:
-                return result
-        return ""
-    if isinstance(theirs, list) and isinstance(ours, list) and len(theirs) == len(ours):
-        for k, (a, b) in enumerate(zip(theirs, ours, strict=True)):
-            result = _difference(a, b, f"{key}.{k}")
-            if result:
-                return result
-        return ""
-    if theirs == ours:
-        return ""
-    if all(isinstance(item, str) and item.startswith(DIGEST) for item in (theirs, ours)):
-        return f"the content of the file {key} has changed"
-    return f"{key} = {theirs!r} there, {ours!r} here"
+def _difference(theirs: Any, ours: Any) -> str:
+    """Describe the first difference between two scenes' data; empty when they compute the same."""
+    there, here = dict(flattened(theirs)), dict(flattened(ours))
+    for key in [*here, *there]:
+        a, b = there.get(key), here.get(key)
+        if a == b or key in MAY_CHANGE:
+            continue
+        if all(isinstance(item, str) and item.startswith(DIGEST) for item in (a, b)):
+            return f"the content of the file {key} has changed"
+        return f"{key} = {a!r} there, {b!r} here"
+    return ""
 
 
 # -- one design of an optimisation as arrays of whole arms, for the checkpoint, and back ---------

@@ -450,6 +450,17 @@ def _plain(node: Any) -> Any:
     return result
 
 
+def flattened(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted key and value of all that a scene's data hold; rows of tables by their names."""
+    if isinstance(data, list) and data and isinstance(data[0], Mapping):
+        data = {row.get("name", number): row for number, row in enumerate(data)}
+    if not isinstance(data, Mapping):
+        yield key, data
+        return
+    for name, value in data.items():
+        yield from flattened(value, f"{key}.{name}" if key else str(name))
+
+
 # -- files that a scene names: known by their content, and found again where a project has moved
 
 DIGEST = "sha256:"  # what a digest in place of a path begins with

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +16,7 @@ from dolfinopt.loading import load_scene
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.messages import model_at, unit_of
 from dolfinopt.scene.old_words import in_new_words
+from dolfinopt.scene.schema import flattened
 from dolfinopt.scene.tables.responses import DECLARED, unused_options
 
 # Label; kind, and the settings that make it.
@@ -131,20 +132,9 @@ def asked_by(words: str) -> Iterator[None]:
 
 def differences(scene: Scene, other: Scene) -> dict[str, tuple[Any, Any]]:
     """Return by its key every value in which scenes differ, here and there; None: not set."""
-    here, there = (dict(_values(item.to_dict())) for item in (scene, other))
+    here, there = (dict(flattened(item.to_dict())) for item in (scene, other))
     pairs = {key: (here.get(key), there.get(key)) for key in [*here, *there]}
     return {key: (a, b) for key, (a, b) in pairs.items() if a != b}
-
-
-def _values(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield key and value of all that a scene's data hold; rows of tables by their names."""
-    if isinstance(data, list) and data and isinstance(data[0], Mapping):
-        data = {row.get("name", number): row for number, row in enumerate(data)}
-    if not isinstance(data, Mapping):
-        yield key, data
-        return
-    for name, value in data.items():
-        yield from _values(value, f"{key}.{name}" if key else str(name))
 
 
 # -- objectives ------------------------------------------------------------------------------

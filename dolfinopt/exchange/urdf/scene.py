@@ -35,6 +35,7 @@ from dolfinopt.exchange.urdf.robot import (
 )
 from dolfinopt.motion.paths import curve_in_time
 from dolfinopt.scene.csv_table import Table, column_names, read_table
+from dolfinopt.scene.toml import toml_value
 
 if TYPE_CHECKING:
     from dolfinopt.exchange.urdf.geometry import LinkCells
@@ -215,7 +216,7 @@ class RobotScene:
             link = max((k for k in (*self.arms, GROUND) if f"{end}.".startswith(f"{k}.")), key=len)
             ends.append((GROUND if link == GROUND else self.arms[link]) + end[len(link) :])
         values = {**one, "between": ends}
-        return ["[[closures]]", *(f"{key} = {_value(value)}" for key, value in values.items())]
+        return ["[[closures]]", *(f"{key} = {toml_value(value)}" for key, value in values.items())]
 
     def _joint(self, body: SceneBody) -> list[str]:
         joint = body.joint
@@ -405,15 +406,6 @@ def _rounded(values: Sequence[float] | np.ndarray) -> str:
 
 def _list(values: Iterable[float]) -> str:
     return "[" + ", ".join(map(number, values)) + "]"
-
-
-def _value(value: Any) -> str:
-    """Return a closure's value in TOML: a word, a number, or an array of either."""
-    if isinstance(value, str):
-        return _string(value)
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    return number(float(value))
 
 
 def _string(text: str) -> str:
