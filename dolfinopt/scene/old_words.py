@@ -186,13 +186,12 @@ OLD_KEYS = {word.old for word in OLD_WORDS}
 def in_new_words(key: str) -> str:
     """Return a dotted key in the words of now, as --set takes it; one of now as it is."""
     key = closures.in_new_words(key)
-    if "." not in key:
-        return key
-    table, *which, name = key.split(".")
+    place, dot, name = key.rpartition(".")
+    table = place.partition(".")[0]
     word = next((item for item in OLD_WORDS if item.old == f"{table}.{name}"), None)
     if word is not None and (result := re.fullmatch(r"[a-z]+\.([a-z_]+)( times it)?", word.new)):
         name = result[1] + ("*" if result[2] else "")
-    return ".".join([table, *which, name])
+    return place + dot + name
 
 
 def rows(tree: Mapping[str, Any], key: str) -> list[Row]:

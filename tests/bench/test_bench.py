@@ -131,6 +131,16 @@ def test_failure_is_told_and_tried_again(measured, tmp_path):
     assert "no ranks" not in (tmp_path / "bench.md").read_text()
 
 
+def test_diagram_of_which_nothing_was_measured_is_told(measured, tmp_path):
+    def fails(step):
+        raise ConvergenceError("no program")
+
+    failures, _ = measured(toy(fails))
+    assert failures and all("no program" in one for one in failures)
+    assert "no program" in (tmp_path / "bench.md").read_text()
+    assert not (tmp_path / "toy.png").exists()
+
+
 def test_ended_bench_keeps_what_is_finished(measured, monkeypatch, tmp_path):
     def ended(step):
         raise KeyboardInterrupt

@@ -409,6 +409,21 @@ def test_without_petsc_one_line_says_how_to_get_it(tmp_path):
     assert not (tmp_path / "o").exists()
 
 
+@pytest.mark.serial
+@pytest.mark.parametrize("stiffening", ["false", "true"])
+def test_arm_of_a_file_without_geometric_stiffness(tmp_path, capsys, stiffening):
+    """A scene that asks for it hears that the file has none; a file that has it is no news."""
+    small = overrides("arms.cells=[20,3]", f"simulation.stiffening={stiffening}")
+    run("export", TWO_ARM, *small, "--out", tmp_path / "bodies")
+    arm2 = f'name = "arm2"\nsid = "{tmp_path}/bodies/arm2.sid"'
+    (tmp_path / "scene.toml").write_text(TWO_ARM.read_text().replace('name = "arm2"', arm2))
+    asked = overrides("arms.arm1.cells=[20,3]", "simulation.stiffening=true")
+    capsys.readouterr()
+    run("export", tmp_path / "scene.toml", *asked, "--out", tmp_path / "out")
+    told = capsys.readouterr().err
+    assert ("arm2.sid holds no geometric stiffness" in told) == (stiffening == "false")
+
+
 # -- what is shown while an optimisation runs, and the time it says to have taken  ----------------
 
 

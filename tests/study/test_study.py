@@ -100,6 +100,7 @@ BAD = [
     ([*OBJECTIVES, "--design", "a.npz"], "--design", "makes its own"),
     ([*OBJECTIVES, "joy"], 'objective.kind = "joy"'),
     ([*OBJECTIVES, "mass"], "a limit under"),
+    ([*REDUCTIONS, "100000"], "100000"),
     ([*REDUCTIONS, "esl"], "esl"),
     ([*SECTIONS, "esl"], "esl: expected nothing behind"),
     ([*SECTIONS, "--design", "a.npz", "--design", "b.npz"], "one file"),
