@@ -17,6 +17,7 @@ FINER_GRID_RATIOS = (1.15, 2.5, 6.0)
 NEIGHBOURS_RATIO = 3.0  # of the lengths of two steps in succession, at most
 GRIDS_LIMIT = 12
 STEPS_LIMIT = 30_000  # over the horizon
+FINE_TOLERANCE = 1e-9  # below it a fifth stage pays: 1e-12 is met with five, not with four
 
 # -- Newton's method -------------------------------------------------------------------------
 

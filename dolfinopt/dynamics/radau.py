@@ -25,6 +25,7 @@ from dolfinopt.dynamics.march import REMEDY, March, march_on_grid
 from dolfinopt.dynamics.measured import (
     ACCEPTED_SHARE,
     AIM,
+    FINE_TOLERANCE,
     FINER_GRID_RATIOS,
     GRIDS_LIMIT,
     MARCH_ERROR_SHARE,
@@ -44,12 +45,10 @@ from dolfinopt.progress import SlowWork
 # Of a whole horizon. What is left is below what Taylor tests see, 1e-10.
 HORIZON_LIMITS = Limits(iterations=40, shortest=1.0 / 64.0, goal=1e-7)
 
-FINE = 1e-9  # tolerance below which a fifth stage pays: 1e-12 is met with five, not with four
-
 
 def stages_for(tolerance: float) -> int:
     """Return the number of stages of the steps of a simulation to this tolerance."""
-    return 4 if tolerance >= FINE else 5
+    return 4 if tolerance >= FINE_TOLERANCE else 5
 
 
 def integrate(
