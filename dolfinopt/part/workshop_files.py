@@ -150,12 +150,12 @@ class _File:
     """The entities of a file, numbered from 1; plane points are in m, heights in mm."""
 
     def __init__(self) -> None:
-        self.lines: list[str] = []
+        self.entities: dict[str, str] = {}
 
     def add(self, entity: str) -> str:
-        """Add an entity and return its number."""
-        self.lines.append(f"#{len(self.lines) + 1} = {entity};")
-        return f"#{len(self.lines)}"
+        """Return the number of an entity, which is added unless it is there."""
+        # Points, directions and axes that edges and faces share: half of the file's size.
+        return self.entities.setdefault(entity, f"#{len(self.entities) + 1}")
 
     def point(self, place: np.ndarray, z: float) -> str:
         return self.add(f"CARTESIAN_POINT('',{_reals((MM * place[0], MM * place[1], z))})")
@@ -223,7 +223,8 @@ class _File:
             f"FILE_NAME({_string(file)},'{DATE}',(''),(''),'dolfinopt','dolfinopt','');\n"
             "FILE_SCHEMA(('AUTOMOTIVE_DESIGN { 1 0 10303 214 1 1 1 1 }'));\nENDSEC;\nDATA;\n"
         )
-        return head + "\n".join(self.lines) + "\nENDSEC;\nEND-ISO-10303-21;\n"
+        lines = [f"{number}={entity};" for entity, number in self.entities.items()]
+        return head + "\n".join(lines) + "\nENDSEC;\nEND-ISO-10303-21;\n"
 
     def _units(self) -> str:
         """Add millimetres, radians and the accuracy of coordinates; return the context."""
@@ -248,8 +249,8 @@ def _along(line: Line) -> tuple[float, float, float]:
 
 
 def _real(value: float) -> str:
-    """Return a number with a decimal point, as the format wants it."""
-    mantissa, *exponent = f"{value:.15g}".split("e")
+    """Return a number with a decimal point, as the format wants it; of lengths to 1e-9 mm."""
+    mantissa, *exponent = f"{round(value, 9):.15g}".split("e")
     mantissa += "" if "." in mantissa else "."
     return "E".join([mantissa, *exponent])
 
