@@ -21,9 +21,10 @@ from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.mesh.hollow import Hull, Member
 from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
+from dolfinopt.part.plane.curves import MM
 from dolfinopt.part.solid.surface import Surface, check_surface
 from dolfinopt.part.stress import EDGE_DISTANCE, REENTRANT_SINE, CornerStress, mean_at_corners
-from dolfinopt.part.workshop_files import MM, three_mf_bytes, triangle_bytes
+from dolfinopt.part.workshop_files import three_mf_bytes, triangle_bytes
 from dolfinopt.scene.tables.arms import WALL_KEYS
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ class HollowPart:
     @property
     def width_words(self) -> list[str]:
         """How thick the wall is, in words."""
-        thin, thick = 1e3 * self.thickness.min(), 1e3 * self.thickness.max()
+        thin, thick = MM * self.thickness.min(), MM * self.thickness.max()
         return [f"wall {thin:.3g} to {thick:.3g} mm"]
 
     def figures(self, density: float) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
 from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, tetrahedra_of
 from dolfinopt.part.domain import INBOARD, OUTBOARD, ROUNDING, SolidDomain
-from dolfinopt.part.plane.curves import Arc, Curve, Shape, Spline, curvature
+from dolfinopt.part.plane.curves import MM, Arc, Curve, Shape, Spline, curvature
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ def body_mesh(
             if not (fitted := mesh.fitted()).is_folded:
                 return fitted
         coarser *= 0.5  # a mesh of twice the sides is no finer than one of them
-    x, y = 1e3 * outline.nearest
+    x, y = MM * outline.nearest
     raise InputError(
         f"its outline cannot be meshed: sides nearly touch at ({x:.1f}, {y:.1f}) mm; choose "
         "another --tool-radius or --tolerance"

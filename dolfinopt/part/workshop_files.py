@@ -16,10 +16,9 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Piece, Shape, Spline
+from dolfinopt.part.plane.curves import DEGREE, MM, Arc, Curve, Line, Piece, Shape, Spline
 from dolfinopt.part.solid.surface import Surface
 
-MM = 1e3  # of a metre
 HALF = 0.9 * np.pi  # sweep of an arc from which on it is divided
 DATE = "2000-01-01T00:00:00"  # of all files, as in DXF: a shape always gives the same bytes
 UP = (0.0, 0.0, 1.0)
@@ -249,8 +248,8 @@ def _along(line: Line) -> tuple[float, float, float]:
 
 
 def _real(value: float) -> str:
-    """Return a number with a decimal point, as the format wants it; of lengths to 1e-9 mm."""
-    mantissa, *exponent = f"{round(value, 9):.15g}".split("e")
+    """Return a number with a decimal point, as the format wants it, to ten digits."""
+    mantissa, *exponent = f"{value:.10g}".split("e")
     mantissa += "" if "." in mantissa else "."
     return "E".join([mantissa, *exponent])
 

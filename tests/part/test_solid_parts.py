@@ -25,7 +25,7 @@ from dolfinopt.mesh.arm_mesh import arm_mesh, box_arm
 from dolfinopt.part.domain import domain_in_scene, solid_domain
 from dolfinopt.part.folder import scene_text
 from dolfinopt.part.mesh import mesh_size, solid_mesh
-from dolfinopt.part.plane.curves import Arc, Piece, Shape
+from dolfinopt.part.plane.curves import MM, Arc, Piece, Shape
 from dolfinopt.part.plane.part import shape_facets
 from dolfinopt.part.solid.part import make_solid_part, measured_widths
 from dolfinopt.part.solid.surface import (
@@ -40,7 +40,7 @@ from dolfinopt.part.solid.surface import (
     outside,
     surface_at,
 )
-from dolfinopt.part.workshop_files import MM, solid_text, three_mf_bytes, triangle_bytes
+from dolfinopt.part.workshop_files import solid_text, three_mf_bytes, triangle_bytes
 from dolfinopt.scene.load import scene_from_dict
 
 trimesh = pytest.importorskip("trimesh")

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 DEGREE = 3
-# Gauss points on [0, 1], exact for polynomials of degree five: area under a cubic.
-_GAUSS = 0.5 + 0.5 * np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
-_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+MM = 1e3  # of a metre
+# Gauss points on [0, 1], exact for the area under a cubic and, to rounding, for arcs.
+GAUSS, WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(12), (1.0, 0.0)))
 MIRROR = np.array([1.0, -1.0])
 KINK = np.radians(1.0)  # turn of the outline at a joint from which on it is a corner
 
@@ -188,8 +188,8 @@ class Spline:
     def area(self) -> float:
         """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
         ends = self.breaks
-        t = (ends[:-1, None] + np.diff(ends)[:, None] * _GAUSS).ravel()
-        weights = (np.diff(ends)[:, None] * _WEIGHTS).ravel()
+        t = (ends[:-1, None] + np.diff(ends)[:, None] * GAUSS).ravel()
+        weights = (np.diff(ends)[:, None] * WEIGHTS).ravel()
         p, d = self.at(t), self.derivative(t)
         return 0.5 * float(weights @ (p[:, 0] * d[:, 1] - p[:, 1] * d[:, 0]))
 
@@ -294,8 +294,8 @@ class Concave:
     free: bool
 
     def __str__(self) -> str:
-        x, y = 1e3 * self.place
-        return f"({x:.1f}, {y:.1f}) mm: {1e3 * self.radius:.2g} mm"
+        x, y = MM * self.place
+        return f"({x:.1f}, {y:.1f}) mm: {MM * self.radius:.2g} mm"
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,10 +17,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from dolfinopt.part.domain import Domain
-from dolfinopt.part.plane.curves import Arc, Curve, Line, Piece, Spline, curvature, direction
-from dolfinopt.part.plane.sides import (
+from dolfinopt.part.plane.curves import (
     GAUSS,
     WEIGHTS,
+    Arc,
+    Curve,
+    Line,
+    Piece,
+    Spline,
+    curvature,
+    direction,
+)
+from dolfinopt.part.plane.sides import (
     ArcMoves,
     BrokenError,
     LineMoves,

@@ -15,14 +15,13 @@ from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
-from dolfinopt.part.plane.curves import Concave, Shape
+from dolfinopt.part.plane.curves import MM, Concave, Shape
 from dolfinopt.part.plane.fit import distance, fitted_sides
 from dolfinopt.part.plane.limits import THIN, limits_of_part, rounded_radii, thinnest_member
 from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
 from dolfinopt.part.plane.sides import Sides
 from dolfinopt.part.stress import corner_stress, is_regular_in_plane
 from dolfinopt.part.workshop_files import (
-    MM,
     dxf_text,
     extruded_facets,
     face_text,
@@ -108,8 +107,8 @@ class PlanePart:
         shape = self.shape
         return (
             f"{1e6 * shape.area:.6g} mm2, {len(shape.loops) - 1} holes, {shape.entities}, at most "
-            f"{1e3 * self.distance:.2g} mm from the outline, tool radius "
-            f"{1e3 * self.outline.tool_radius:.3g} mm"
+            f"{MM * self.distance:.2g} mm from the outline, tool radius "
+            f"{MM * self.outline.tool_radius:.3g} mm"
         )
 
     @property
@@ -133,15 +132,15 @@ class PlanePart:
         if self.tight:
             listed = "; ".join(map(str, self.tight[:TOLD]))
             more = f"; {len(self.tight) - TOLD} more in part.json" if len(self.tight) > TOLD else ""
-            tool = 1e3 * outline.tool_radius
+            tool = MM * outline.tool_radius
             result.append(
                 f"arm {domain.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
             )
         least = domain.minimum_member or THIN
         if self.thinnest is not None and self.thinnest < 0.9 * least:
             result.append(
-                f"arm {domain.name!r}: its thinnest neck is {1e3 * self.thinnest:.3g} mm wide, "
-                f"below the smallest that is asked for, {1e3 * least:.3g} mm"
+                f"arm {domain.name!r}: its thinnest neck is {MM * self.thinnest:.3g} mm wide, "
+                f"below the smallest that is asked for, {MM * least:.3g} mm"
             )
         return result
 

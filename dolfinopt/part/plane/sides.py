@@ -25,7 +25,10 @@ from functools import cached_property
 import numpy as np
 
 from dolfinopt.part.plane.curves import (
+    GAUSS,
     MIRROR,
+    MM,
+    WEIGHTS,
     Arc,
     Curve,
     Line,
@@ -40,7 +43,6 @@ from dolfinopt.part.plane.curves import (
 PARALLEL = 1e-4  # sine of the angle between two sides below which they do not meet
 MEETINGS = 40  # of Newton's steps to where two sides meet
 CLOSE = 1e-13  # m, last of these steps
-GAUSS, WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(12), (1.0, 0.0)))
 
 
 class BrokenError(Exception):
@@ -179,7 +181,7 @@ def meet(a: Side, b: Side, reach: float, near: np.ndarray) -> np.ndarray:
         place = place + step
         if np.abs(step).max() < CLOSE:
             return place
-    x, y = 1e3 * near
+    x, y = MM * near
     raise BrokenError(f"two sides do not meet near ({x:.1f}, {y:.1f}) mm")
 
 
@@ -459,7 +461,7 @@ class Sides:
         T = _tied(count, pairs, held)
         half = np.ones(count)
         for key, j in sides.items():
-            half[j + 1] = 0.5 * self._lengths[key]
+            half[j + 1] = 0.5 * self.lengths[key]
         return T / (np.abs(T) * half[:, None]).max(axis=0, initial=1e-9)
 
     def _beside(self, i: int, k: int, twins: bool = False) -> tuple[int, int]:
@@ -468,7 +470,8 @@ class Sides:
         return (after.twin, before.twin) if twins else (before.key, after.key)
 
     @cached_property
-    def _lengths(self) -> dict[tuple[int, int], float]:
+    def lengths(self) -> dict[tuple[int, int], float]:
+        """From end to end of every side by its loop and number, m."""
         return {
             (item.loop, item.side): float(
                 np.linalg.norm(item.piece.curve.end - item.piece.curve.start)

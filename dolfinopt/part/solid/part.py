@@ -17,7 +17,7 @@ from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import ROUNDS, SAME_VOLUME, mesh_size, solid_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
-from dolfinopt.part.plane.curves import Shape
+from dolfinopt.part.plane.curves import MM, Shape
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
 from dolfinopt.part.solid.surface import (
     WHOLE,
@@ -33,7 +33,7 @@ from dolfinopt.part.solid.surface import (
 )
 from dolfinopt.part.solid.widths import Widths, measured_widths
 from dolfinopt.part.stress import corner_stress, is_regular_in_space
-from dolfinopt.part.workshop_files import MM, dxf_text, solid_text, three_mf_bytes, triangle_bytes
+from dolfinopt.part.workshop_files import dxf_text, solid_text, three_mf_bytes, triangle_bytes
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
@@ -96,7 +96,7 @@ class SolidPart:
         if self.flat is not None:
             rows, where = f"{len(self.flat.shape.curves)} curves", "the outline"
         return (
-            f"{1e9 * self.volume:.6g} mm3, {rows}, at most {1e3 * self.distance:.2g} mm from "
+            f"{1e9 * self.volume:.6g} mm3, {rows}, at most {MM * self.distance:.2g} mm from "
             f"{where}, {', '.join(self.width_words) or 'nothing thin'}"
         )
 
@@ -104,7 +104,7 @@ class SolidPart:
     def width_words(self) -> list[str]:
         """What is narrowest, in words."""
         widths = {"thinnest member": self.widths.member, "narrowest gap": self.widths.gap}
-        return [f"{name} {1e3 * w:.2g} mm" for name, w in widths.items() if w is not None]
+        return [f"{name} {MM * w:.2g} mm" for name, w in widths.items() if w is not None]
 
     @cached_property
     def widths(self) -> Widths:
@@ -153,7 +153,7 @@ class SolidPart:
                 f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
             )
         if len(self.cavities):
-            places = "; ".join("({:.1f}, {:.1f}, {:.1f})".format(*at) for at in 1e3 * self.cavities)
+            places = "; ".join("({:.1f}, {:.1f}, {:.1f})".format(*at) for at in MM * self.cavities)
             result.append(
                 f"arm {domain.name!r}: closed cavities at {places} mm, which no tool and no powder "
                 "leaves; [[arms.regions]] keeps a way out void"
@@ -168,12 +168,12 @@ class SolidPart:
             ("thinnest member", self.widths.member, domain.minimum_member, "minimum_member"),
             ("narrowest gap", self.widths.gap, domain.minimum_gap, "minimum_gap"),
         ):
-            limit = f"{key}, {1e3 * asked:.3g} mm"
+            limit = f"{key}, {MM * asked:.3g} mm"
             if asked == 0.0:
                 asked = domain.filter_radius
-                limit = f"the filter's radius, {1e3 * asked:.3g} mm"
+                limit = f"the filter's radius, {MM * asked:.3g} mm"
             if width is not None and width < NARROW * asked:
-                result.setdefault(limit, []).append(f"its {name} is {1e3 * width:.2g} mm wide")
+                result.setdefault(limit, []).append(f"its {name} is {MM * width:.2g} mm wide")
         return [
             f"arm {domain.name!r}: {' and '.join(words)}, below {limit}"
             for limit, words in result.items()

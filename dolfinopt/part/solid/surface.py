@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.part.domain import SolidDomain
+from dolfinopt.part.plane.curves import MM
 
 BELOW = 0.98  # the highest level, over the highest density
 APART = 0.005  # least difference of a node's density from the level
@@ -463,7 +464,7 @@ def check_surface(name: str, surface: Surface) -> None:
             return
         where = surface.corners[crossed[0, 0]]
         what = f"crosses itself in {len(crossed)} places"
-    x, y, z = 1e3 * where.mean(axis=0)
+    x, y, z = MM * where.mean(axis=0)
     raise InputError(
         f"arm {name!r}: the surface of its part {what}, the first at ({x:.1f}, {y:.1f}, {z:.1f}) "
         "mm; optimise with larger members (design.filter_radius), and with "
