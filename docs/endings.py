@@ -24,7 +24,6 @@ SHORT = ["design.sharpness=8", "design.continuation=10"]
 COARSE = {
     "two_arm.toml": ["arms.cells=[100,6]", "design.filter_radius=0.02"],
     "lightest_two_arm.toml": ["arms.cells=[80,6]", "design.filter_radius=0.025", *SHORT],
-    "scara.toml": ["arms.mesh_size=0.012", "design.filter_radius=0.024", *SHORT],
     "spatial_arm.toml": ["arms.cells=[30,4,3]", "design.filter_radius=0.03"],
 }
 KERNELS = {"Haswell": "avx2", "SkylakeX": "avx512f", "Zen": "avx2", "Nehalem": "sse4_2"}
@@ -64,7 +63,7 @@ def main() -> None:
     for name in [one for one in asked if one != "--coarse"] or COARSE:
         scene = str(DEMOS / name) if (DEMOS / name).is_file() else name
         for kernel, ranks in runs:
-            one = ending(scene, COARSE[name] if coarse else [], kernel, ranks)
+            one = ending(scene, COARSE.get(name, []) if coarse else [], kernel, ranks)
             words = one["iterations"], one["stop_code"], f"{one['objective']:.7g}"
             print("|", " | ".join(map(str, [name, kernel, ranks, *words])), "|", flush=True)
 
