@@ -10,6 +10,7 @@ and the last stage ends the step.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
@@ -221,6 +222,11 @@ class Solution:
         elif derivative == 1:
             value += self.qd[step]
         return value
+
+    def in_coordinates(self, change: Callable[[np.ndarray], np.ndarray]) -> Solution:
+        """Return it in other coordinates (..., N'), by what makes them of (..., N)."""
+        q, qd, a = (change(x) for x in (self.q, self.qd, self.a))
+        return replace(self, q=q, qd=qd, a=a)
 
     def accelerations(self, time_grid: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """Return qdd (m, s, N) at the nodes (s,) of the steps of another grid (m + 1,), s.

@@ -170,6 +170,18 @@ class MachineSystem:
         rest = rigid + np.arange(self.num_coordinates - R)
         return np.concatenate([self.drives.free, rest])
 
+    def unknowns_of(self, known: MachineSystem, x: np.ndarray) -> np.ndarray:
+        """Return the unknowns (..., S) where this machine moves as another does, of its own x.
+
+        Drives that are free here alone are where the motion has them; so are motors before springs.
+        """
+        out = np.zeros((*x.shape[:-1], self.num_coordinates))
+        free = np.searchsorted(self.drives.free, known.drives.free)
+        out[..., free] = x[..., : len(free)]
+        out[..., self.elastic_columns] = x[..., known.elastic_columns]
+        out[..., self.constraint_columns] = x[..., known.constraint_columns]
+        return out
+
     # -- at instants -------------------------------------------------------------------------
 
     def at(self, t: np.ndarray) -> MachineInstants:

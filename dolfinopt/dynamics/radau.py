@@ -7,7 +7,6 @@ Differential Equations II (1996), IV.5, IV.8, doi:10.1007/978-3-642-05221-7.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -113,7 +112,7 @@ def on_grid(
         a, converged = run.solve(run.first_guess())
         if not converged:
             raise ConvergenceError(f"Newton's method fails with {len(a)} time steps; {REMEDY}")
-    return _changed(run.judged(a)[0], preconditioner.from_modes)
+    return run.judged(a)[0].in_coordinates(preconditioner.from_modes)
 
 
 class _Integration:
@@ -136,7 +135,7 @@ class _Integration:
         self._tolerance, self._stages = tolerance, stages
         if guess is not None and guess.a.shape[2] != self._system.num_coordinates:
             guess = None
-        self._last = None if guess is None else _changed(guess, preconditioner.to_modes)
+        self._last = None if guess is None else guess.in_coordinates(preconditioner.to_modes)
         self.time_grid = time_grid
         self.strategy = Strategy.HORIZON if preconditioner.guided else Strategy.FREE
         self._step_error = MARCH_ERROR_SHARE * tolerance
@@ -163,7 +162,7 @@ class _Integration:
                 continue
             before, self._last = self._last, solution
             if solution.error <= ACCEPTED_SHARE * self._tolerance:
-                return _changed(solution, self._preconditioner.from_modes)
+                return solution.in_coordinates(self._preconditioner.from_modes)
             grid = self._finer(errors, before, marched)
             lost = solution.error < ROUNDING and self._stalled
             if lost or len(grid) > STEPS_LIMIT or self._stalled > 3:
@@ -193,7 +192,7 @@ class _Integration:
         """Return what was found last if it meets the tolerance itself, or say why there is none."""
         last, steps = self._last, len(self.time_grid) - 1
         if last is not None and last.error <= self._tolerance:
-            return _changed(last, self._preconditioner.from_modes)
+            return last.in_coordinates(self._preconditioner.from_modes)
         if last is None:
             raise ConvergenceError(
                 "the simulation does not converge: its result still changes with the number of "
@@ -266,9 +265,3 @@ def _prescribed(system: System, stages: int) -> Solution:
     time_grid, nodes = np.array(system.breakpoints), radau_iia(stages).c
     a = np.zeros((len(time_grid) - 1, stages, 0))
     return Solution(time_grid, nodes, a[:, 0], a[:, 0], a, 0.0, 0)
-
-
-def _changed(solution: Solution, change: Callable[[np.ndarray], np.ndarray]) -> Solution:
-    """Return a solution in other coordinates."""
-    q, qd, a = (change(x) for x in (solution.q, solution.qd, solution.a))
-    return replace(solution, q=q, qd=qd, a=a)

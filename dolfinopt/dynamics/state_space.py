@@ -13,7 +13,6 @@ from dolfinopt.dynamics.linearised import Linearised
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.poles import damping_ratios
 from dolfinopt.multibody.kinematics import Posed, SiteMotion
-from dolfinopt.multibody.shape_integrals import Rates
 
 OUTPUTS = ("tool", "deflection")
 WRENCH = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
@@ -96,20 +95,6 @@ def linear_model(linearised: Linearised, closed: bool) -> StateSpace:
         output_units=(*units, *["m"] * (2 * d)),
         closed=closed,
     )
-
-
-def freed_rates(system: MachineSystem, known: MachineSystem, rates: Rates) -> Rates:
-    """Return the unknowns of a machine with free drives that moves as `known` does.
-
-    Drives that nothing controls are where the motion has them; so are motors before springs.
-    """
-    every = np.zeros((3, 1, system.num_coordinates))
-    free = np.searchsorted(system.drives.free, known.drives.free)
-    for new, old in zip(every, rates, strict=True):
-        new[:, free] = old[:, : len(free)]
-        new[:, system.elastic_columns] = old[:, known.elastic_columns]
-        new[:, system.constraint_columns] = old[:, known.constraint_columns]
-    return every[0], every[1], every[2]
 
 
 def coordinate_names(system: MachineSystem) -> list[str]:
