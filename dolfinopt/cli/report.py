@@ -73,7 +73,8 @@ def _choices(summary: Summary) -> Iterator[str]:
         pairs = zip(moved["corrections"].items(), units, strict=True)
         joints = ", ".join(f"{name} by up to {x:.3g} {unit}" for (name, x), unit in pairs)
         rate = moved["slowest_unstable_rate"]
-        begins = f", begun about {3e3 / rate:.2g} ms before it moves" if rate else ""
+        begun = "begun" if moved["lead"] > 0.0 else "which without lead cannot begin"
+        begins = f", {begun} about {3e3 / rate:.2g} ms before it moves" if rate else ""
         yield (
             f"feed-forward: joints {joints}{begins}; the tip stays "
             f"{1e3 * moved['deviation_left']:.2g} mm off its path "

@@ -43,8 +43,6 @@ def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str
     names, units = list(scene.rigid_units), list(scene.rigid_units.values())
     joints, splines = found.corrections.joints, found.corrections.splines
     largest = np.abs(found.corrections.at(np.linspace(0.0, scene.horizon, 2001))[0]).max(axis=0)
-    rates = internal_rates(found)
-    unstable = rates.real[rates.real > 0.0] if rates is not None else np.zeros(0)
     return {
         "joints": [names[k] for k in joints],
         "lead": scene.lead,
@@ -53,7 +51,7 @@ def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str
         "deviation_without": found.before,
         "deviation_left": found.left,
         "corrections": {names[k]: float(x) for k, x in zip(joints, largest, strict=True)},
-        "slowest_unstable_rate": float(unstable.min()) if len(unstable) else None,
+        "slowest_unstable_rate": slowest_unstable_rate(found),
         "units": {
             "lead": "s",
             "knots": "-",
@@ -64,3 +62,24 @@ def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str
             "slowest_unstable_rate": "1/s",
         },
     }
+
+
+def slowest_unstable_rate(found: FeedForward) -> float | None:
+    """Return that of the internal dynamics, 1/s; None where there is none, or it is not known."""
+    rates = internal_rates(found)
+    unstable = rates.real[rates.real > 0.0] if rates is not None else np.zeros(0)
+    return float(unstable.min()) if len(unstable) else None
+
+
+def lead_warnings(trajectory: Trajectory | None, grey: bool) -> list[str]:
+    """Return that corrections would begin earlier than the lead lets them, and what to do."""
+    if trajectory is None or trajectory.feed_forward is None:
+        return []
+    rate, lead = slowest_unstable_rate(trajectory.feed_forward), trajectory.scene.lead
+    if rate is None or not 0.0 < lead < 3.0 / rate:
+        return []
+    cells = "nearly void cells of a grey design vibrate slowly: set design.projection, or "
+    return [
+        f"feed-forward: the corrections would begin about {3e3 / rate:.2g} ms before the motion, "
+        f"which feed_forward.lead = {lead:g} [s] cuts off; {cells if grey else ''}raise it"
+    ]

@@ -24,7 +24,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
-from dolfinopt.output.feed_forward import summary_of_feed_forward
+from dolfinopt.output.feed_forward import lead_warnings, summary_of_feed_forward
 from dolfinopt.output.joint_limits import JointLimit, joint_limits
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import (
@@ -360,11 +360,13 @@ def motion_warnings(run: Result) -> list[str]:
 
 
 def _all_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
+    grey = is_grey(run.scene, _grayness(traits))
     return [
         *(note for trait in traits.values() for note in trait.notes),
         *motion_warnings(run),
         *_unstiffened(stiffening_of(run.arms)),
-        *([] if is_grey(run.scene, _grayness(traits)) else _contact_warnings(run, traits)),
+        *lead_warnings(run.trajectory, grey),
+        *([] if grey else _contact_warnings(run, traits)),
         *(item.sentence for item in _too_narrow(run, traits)),
     ]
 

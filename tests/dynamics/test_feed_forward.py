@@ -19,7 +19,12 @@ from dolfinopt.dynamics.feed_forward import (
 )
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.output.feed_forward import FILE, write_feed_forward
+from dolfinopt.output.feed_forward import (
+    FILE,
+    lead_warnings,
+    slowest_unstable_rate,
+    write_feed_forward,
+)
 from dolfinopt.profiling import Profile
 
 pytestmark = pytest.mark.serial  # the trajectory belongs to one rank
@@ -153,6 +158,17 @@ def test_under_control(plain) -> None:
     told = 'control.feed_forward="tip"', "simulation.tolerance=1e-3", "motion.horizon=2.2"
     found = small(TIP, "control.stiffness=[1e6,2e5,1e5]", "control.damping=[2e3,5e2,2e2]", *told)
     assert found.max_deviation[0] < 1e-3 * plain.max_deviation[0]
+    assert not found.solution.is_marched  # it begins from the motion that the forces are made for
+
+
+def test_short_leads_are_told(moved) -> None:
+    """Where the corrections would begin before the lead does; a grey design has a remedy more."""
+    begin = 3.0 / slowest_unstable_rate(moved.feed_forward)
+    assert begin < moved.scene.lead and not lead_warnings(moved, grey=True)
+    short = small(TIP, f"feed_forward.lead={0.5 * begin}")
+    (told,) = lead_warnings(short, grey=False)
+    assert "feed_forward.lead" in told and f"{1e3 * begin:.2g} ms" in told
+    assert "design.projection" in lead_warnings(short, grey=True)[0]
 
 
 def test_internal_dynamics_mirror_without_damping() -> None:
