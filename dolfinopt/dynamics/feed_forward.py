@@ -34,6 +34,7 @@ from dolfinopt.dynamics.collocation import (
 )
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
+    ACROSS_SHARE,
     CURVATURE_STEPS,
     CURVED_SHARE,
     EXACT,
@@ -213,19 +214,32 @@ def off_path(machine: MachineSystem, solution: Solution, t: np.ndarray) -> np.nd
     return end_effector(machine.mechanism, state.motion, state.elastic[0]) - path_of(machine, t)
 
 
-def tip_by_joints(machine: MachineSystem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tip's Jacobian of rigid arms (n, d, R), over the reach, and its instants, s.
+def tip_by_joints(machine: MachineSystem, t: np.ndarray) -> np.ndarray:
+    """Return the tip's Jacobian of rigid arms (n, d, R) at instants (n,), s, over the reach.
 
     Joints that follow in closed loops follow.
     """
-    t = np.linspace(0.0, machine.breakpoints[-1], TIP_INSTANTS)
     motion, none = machine.motion(t), np.zeros((len(t), machine.mechanism.num_coordinates))
     J = tip_jacobians(machine, motion, none)[1]
     if machine.loops is not None:
         dependent = machine.drives.dependent
         G = machine.loops.at(machine.rigid, motion.q, none[:, :0]).jacobian
         J = J - J[:, :, dependent] @ np.linalg.pinv(G[:, :, dependent]) @ G[:, :, : J.shape[2]]
-    return J / machine.mechanism.levers, t
+    return np.asarray(J / machine.mechanism.levers)
+
+
+def across(machine: MachineSystem, joints: np.ndarray, t: np.ndarray, off: np.ndarray) -> float:
+    """Return how far the tip is off its path, m, where no corrected joint can move it.
+
+    Args:
+        machine: without corrections.
+        joints: (F,) rigid coordinates.
+        t: (n,) s.
+        off: (n, d) all of it, m.
+    """
+    J = tip_by_joints(machine, t)[:, :, joints]
+    along = J @ (np.linalg.pinv(J) @ off[:, :, None])
+    return float(lengths(off - along[:, :, 0]).max())
 
 
 # -- linearised motion -----------------------------------------------------------------------
@@ -542,8 +556,8 @@ def feed_forward_of(
 ) -> FeedForward:
     """Return the corrections of a machine.
 
-    The knots are as close as it takes to leave `LEFT_AIM` of the deviation, or as they are asked
-    for.
+    The knots are as close as it takes to leave `LEFT_AIM` of the deviation, or what no joint can
+    take away; or as they are asked for.
 
     Args:
         machine: without corrections.
@@ -577,8 +591,10 @@ def feed_forward_of(
             corrections = replace(corrections, coefficients=squares.step(corrections.coefficients))
             moved = corrected(machine, corrections)
             solution = guess = run(moved, guess=guess)
-        left = float(lengths(off_path(moved, solution, squares.t)).max())
-        if asked.spacing or left <= LEFT_AIM * before or left > 0.5 * last:
+        off = off_path(moved, solution, squares.t)
+        left = float(lengths(off).max())
+        aim = max(LEFT_AIM * before, ACROSS_SHARE * across(machine, joints, squares.t, off))
+        if asked.spacing or left <= aim or left > 0.5 * last:
             break
         spacing, last = 0.5 * spacing, left
     curved = redundant or left > CURVED_SHARE * before
@@ -602,7 +618,8 @@ def joints_of(
     """
     names = list(machine.names.units)
     every = np.sort([names.index(name) for name in machine.names.driven])
-    J, t = tip_by_joints(machine)
+    t = np.linspace(0.0, machine.breakpoints[-1], TIP_INSTANTS)
+    J = tip_by_joints(machine, t)
     needed = min(int(np.linalg.matrix_rank(J[:, :, every]).max()), len(every))
     if asked is None:
         joints = max(
