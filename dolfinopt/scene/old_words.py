@@ -124,8 +124,8 @@ def _way(tree: Tree, row: Row, value: Any) -> None:
 
 
 def _eroded(tree: Tree, row: Row, value: Any) -> None:
-    robust = row.get("projection") == "robust"
-    row["projection"] = f"robust-{value}" if robust and value != "nominal" else row["projection"]
+    if row.get("projection") == "robust" and value != "nominal":
+        row["projection"] = f"robust-{value}"
 
 
 def _first_mode(tree: Tree, row: Row, value: Any) -> None:

@@ -26,6 +26,7 @@ ROBUST = ("design.projection=robust",)
         ((), "simulation.stages=3", "simulation.sample=1e-3"),  # none of its own any more
         (ROBUST, "design.limits_on=eroded", "design.projection=robust-eroded"),
         (ROBUST, "design.limits_on=nominal", "design.projection=robust"),
+        ((), "design.limits_on=eroded", "design.projection=false"),  # only robust ones have it
         ((), "arms.arm2.pattern=arm1", "arms.arm2.design=arm1"),
     ],
 )
