@@ -68,19 +68,8 @@ def _choices(summary: Summary) -> Iterator[str]:
     if start := summary["loop_start"]:
         joints = ", ".join(f"{name} = {value:.4g}" for name, value in start.items())
         yield f"closures: loops start with {joints}; motion.initial_joints chooses the branch"
-    if moved := summary["feed_forward"]:
-        units = moved["units"]["corrections"].split(", ")
-        pairs = zip(moved["corrections"].items(), units, strict=True)
-        joints = ", ".join(f"{name} by up to {x:.3g} {unit}" for (name, x), unit in pairs)
-        rate = moved["slowest_unstable_rate"]
-        begun = "begun" if moved["lead"] > 0.0 else "which without lead cannot begin"
-        begins = f", {begun} about {3e3 / rate:.2g} ms before it moves" if rate else ""
-        yield (
-            f"feed-forward: joints {joints}{begins}; the tip stays "
-            f"{1e3 * moved['deviation_left']:.2g} mm off its path "
-            f"({1e3 * moved['deviation_without']:.4g} mm without, to first order); "
-            "feed_forward.csv has the joints"
-        )
+    if summary["feed_forward"]:
+        yield from _feed_forward(summary)
     result = summary["reduction"]
     if result["error_estimate"] is not None:
         yield chosen(result["coordinates"], result["error_estimate"])
@@ -90,6 +79,32 @@ def _choices(summary: Summary) -> Iterator[str]:
             'simulation.stiffening = "auto": on, the loads of the motion change the stiffness of '
             f"an arm by {100.0 * loads['estimate']:.2g} %"
         )
+
+
+def _feed_forward(summary: Summary) -> Iterator[str]:
+    """Yield what joints do about arms that bend, what that leaves, and what drives it takes."""
+    moved = summary["feed_forward"]
+    units = moved["units"]["corrections"].split(", ")
+    pairs = zip(moved["corrections"].items(), units, strict=True)
+    joints = ", ".join(f"{name} by up to {x:.3g} {unit}" for (name, x), unit in pairs)
+    rate = moved["slowest_unstable_rate"]
+    begun = "begun" if moved["lead"] > 0.0 else "which without lead cannot begin"
+    begins = f", {begun} about {3e3 / rate:.2g} ms before it moves" if rate else ""
+    yield f"feed-forward: joints {joints}{begins}; feed_forward.csv has the joints"
+    finer, without = moved["deviation_left_finer"], moved["deviation_without"]
+    there = (
+        ""
+        if finer is None
+        else (
+            f", {1e3 * finer:.2g} mm in a model of twice the coordinates with geometric stiffness"
+        )
+    )
+    here = "" if without is None else f" ({1e3 * without:.4g} mm without)"
+    yield f"  the tip stays {1e3 * moved['deviation_left']:.2g} mm off its path{here}{there}"
+    if before := moved["drive_peak_without"]:
+        after, units = summary["drive_peak"], summary["units"]["drive_peak"]
+        peaks = (f"{name} {after[name]:.4g} {units[name]} ({before[name]:.4g})" for name in before)
+        yield f"  peak drives, and without feed-forward: {', '.join(peaks)}"
 
 
 def _objective(result: Result, summary: Summary) -> str:

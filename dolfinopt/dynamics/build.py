@@ -401,8 +401,9 @@ def simulate(
                 problem = with_known_forces(problem, feed_forward)
                 # On its first steps the drives' errors are as small as the estimate of them, and
                 # it would be marched: 1.26 for 0.18 s.
-                nearly = partial(problem.unknowns_of, feed_forward.machine)
-                start = start or feed_forward.solution.in_coordinates(nearly)
+                if own and start is None:
+                    nearly = partial(problem.unknowns_of, feed_forward.machine)
+                    start = feed_forward.solution.in_coordinates(nearly)
         if own and feed_forward is not None and scene.control is None:
             problem, solution = feed_forward.machine, feed_forward.solution
         else:

@@ -2,20 +2,135 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
+from sys import maxsize
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.arms.arm import chain_of
 from dolfinopt.disk import write_table
+from dolfinopt.dynamics.build import Trajectory, simulate
 from dolfinopt.dynamics.feed_forward import FeedForward, internal_rates
+from dolfinopt.errors import ConvergenceError
+from dolfinopt.output.trajectory import drive_units
+from dolfinopt.parallel import Partition, gather_arms, on_root, together
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.csv_table import BESIDE_JOINTS
-from dolfinopt.scene.load import Scene
+from dolfinopt.scene.load import Scene, scene_from_dict
 
 if TYPE_CHECKING:
-    from dolfinopt.dynamics.build import Trajectory
+    from dolfinopt.arms.arm import Arm
+    from dolfinopt.optimization.result import RankResult
 
 FILE = "feed_forward.csv"
+ROUNDING = 1e-6  # of an eigenvalue's real part, over its size
+
+
+# -- machines beside it ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What a machine with feed-forward is compared with; None where that is not solved.
+
+    Attributes:
+        deviation: without corrections, m; `peaks` of the drives then, by their names, N m or N.
+        finer: deviation in a finer model that moves with the corrections, m.
+    """
+
+    deviation: float | None
+    peaks: Mapping[str, float]
+    finer: float | None
+
+
+def machines_beside(run: RankResult) -> Beside | None:
+    """Simulate the design without its feed-forward, and in a finer model with it (collective).
+
+    None where the scene has no feed-forward.
+    """
+    scene = run.scene
+    if not scene.feed_forward.on:
+        return None
+    held = None if run.trajectory is None else run.trajectory.feed_forward
+    place = run.partition, run.arms, run.x_phys
+    with run.profile.phase("feed-forward beside"):
+        plain = simulated_with(with_feed_forward(scene, "none"), *place)
+        finer = finer_deviation(scene, *place, held)
+
+    def beside() -> Beside:
+        if plain is None:
+            return Beside(None, {}, finer)
+        peaks = map(float, plain.drives[0][scene.driven_columns])
+        return Beside(plain.max_deviation[0], dict(zip(scene.driven, peaks, strict=True)), finer)
+
+    return on_root(run.partition.world, beside)
+
+
+def with_feed_forward(scene: Scene, kind: str) -> Scene:
+    """Return the scene with feed-forward of a kind, of its control, too."""
+    data = scene.to_tree()
+    data["feed_forward"] = data["feed_forward"] | {"kind": kind} if kind != "none" else {}
+    if scene.control is not None and scene.control.feed_forward in ("rigid", "tip"):
+        data["control"]["feed_forward"] = "tip" if kind == "tip" else "rigid"
+    return scene_from_dict(data, scene.source)
+
+
+def finer_deviation(
+    scene: Scene,
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    x_phys: Mapping[int, np.ndarray],
+    held: FeedForward | None,
+) -> float | None:
+    """Return the largest deviation in a finer model, m; None where it is not solved (collective).
+
+    It has twice the elastic coordinates, and geometric stiffness.
+
+    Args:
+        scene, partition, arms: of the model, with the number of coordinates.
+        x_phys: the design.
+        held: the model's corrections, on the root, with which the finer one moves, too.
+    """
+    sizes = [min(2 * (arm.coordinates or 0), arm.substructure.T.num_dofs) for arm in arms.values()]
+    count = partition.world.allreduce(min(sizes, default=maxsize), min)
+    changes = {
+        "reduction": scene.reduction.unchecked_copy({"coordinates": count}),
+        "simulation": scene.simulation.unchecked_copy({"stiffening": True}),
+    }
+    moved = simulated_with(scene.unchecked_copy(changes), partition, arms, x_phys, held)
+    return on_root(partition.world, lambda: None if moved is None else moved.max_deviation[0])
+
+
+def simulated_with(
+    scene: Scene,
+    partition: Partition,
+    arms: Mapping[int, Arm],
+    x_phys: Mapping[int, np.ndarray],
+    held: FeedForward | None = None,
+) -> Trajectory | None:
+    """Return the motion of a scene with other arms' designs, on the root (collective).
+
+    None elsewhere, and where it is not solved. The arms keep what they have.
+    """
+    with together(partition.world):
+        bodies = {k: arm.under(scene).reduce(x_phys[k]) for k, arm in arms.items()}
+    owned = gather_arms(partition, bodies)
+
+    result: list[Trajectory] = []
+
+    def run() -> None:
+        with suppress(ConvergenceError):
+            result.append(simulate(scene, chain_of(scene, owned), Profile(), feed_forward=held))
+
+    on_root(partition.world, run)
+    return result[0] if result else None
+
+
+# -- table and summary -----------------------------------------------------------------------
 
 
 def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
@@ -36,9 +151,11 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
     write_table(folder / FILE, header, columns, 15)
 
 
-def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str, Any] | None:
+def summary_of_feed_forward(
+    scene: Scene, found: FeedForward | None, beside: Beside | None
+) -> dict[str, Any] | None:
     """Return what summary.json tells of a feed-forward; None without."""
-    if found is None:
+    if found is None or beside is None:
         return None
     names, units = list(scene.rigid_units), list(scene.rigid_units.values())
     joints, splines = found.corrections.joints, found.corrections.splines
@@ -48,8 +165,10 @@ def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str
         "lead": scene.lead,
         "knots": len(splines.knots),
         "regularity": found.regularity,
-        "deviation_without": found.before,
+        "deviation_without": beside.deviation,
         "deviation_left": found.left,
+        "deviation_left_finer": beside.finer,
+        "drive_peak_without": dict(beside.peaks),
         "corrections": {names[k]: float(x) for k, x in zip(joints, largest, strict=True)},
         "slowest_unstable_rate": slowest_unstable_rate(found),
         "units": {
@@ -58,6 +177,8 @@ def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str
             "regularity": "-",
             "deviation_without": "m",
             "deviation_left": "m",
+            "deviation_left_finer": "m",
+            "drive_peak_without": drive_units(scene),
             "corrections": ", ".join(units[k] for k in joints),
             "slowest_unstable_rate": "1/s",
         },
@@ -67,7 +188,9 @@ def summary_of_feed_forward(scene: Scene, found: FeedForward | None) -> dict[str
 def slowest_unstable_rate(found: FeedForward) -> float | None:
     """Return that of the internal dynamics, 1/s; None where there is none, or it is not known."""
     rates = internal_rates(found)
-    unstable = rates.real[rates.real > 0.0] if rates is not None else np.zeros(0)
+    if rates is None:
+        return None
+    unstable = rates.real[rates.real > ROUNDING * np.abs(rates)]  # undamped ones are beside zero
     return float(unstable.min()) if len(unstable) else None
 
 

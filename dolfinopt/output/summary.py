@@ -24,7 +24,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
-from dolfinopt.output.feed_forward import lead_warnings, summary_of_feed_forward
+from dolfinopt.output.feed_forward import lead_warnings, machines_beside, summary_of_feed_forward
 from dolfinopt.output.joint_limits import JointLimit, joint_limits
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import (
@@ -121,7 +121,7 @@ def summarise(
     """
     scene, partition = run.scene, run.partition
     cost = _cost(run, wall)  # without what follows
-    traits = _gather_traits(run)
+    traits, beside = _gather_traits(run), machines_beside(run)
     with together(partition.world):
         if partition.world.rank != 0:
             return {}
@@ -133,7 +133,7 @@ def summarise(
             "loop_start": loop_start(scene),
             "feed_forward": None
             if run.trajectory is None
-            else summary_of_feed_forward(scene, run.trajectory.feed_forward),
+            else summary_of_feed_forward(scene, run.trajectory.feed_forward, beside),
             "deflection_budget": budget_of(run.trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, traits),

@@ -19,11 +19,12 @@ from mpi4py import MPI
 
 from dolfinopt.arms.arm import chain_of
 from dolfinopt.disk import make_folder, write_text
-from dolfinopt.dynamics.build import build_system, desired_motion, simulate
-from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.dynamics.build import build_system, desired_motion
+from dolfinopt.errors import InputError
 from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.output.design import arms_with_design
+from dolfinopt.output.feed_forward import finer_deviation, simulated_with, with_feed_forward
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -51,12 +52,12 @@ class Motion(NamedTuple):
     Attributes:
         case: its simulation, labelled.
         longer: by how much it takes longer than the scene's, s.
-        finer: deviation in a finer model, m; nan where there is none.
+        finer: deviation in a finer model, m; None where there is none.
     """
 
     case: Case
     longer: float = 0.0
-    finer: float = math.nan
+    finer: float | None = None
 
 
 def study_motions(scene: Scene, designs: Sequence[Path], runner: Runner) -> Study:
@@ -74,7 +75,7 @@ def study_motions(scene: Scene, designs: Sequence[Path], runner: Runner) -> Stud
     design = on_root(runner.world, _design, scene, designs)
     files = [design]
     if isinstance(design, Case):
-        searched = [design, Case(with_kind(scene, "tip"), "optimize", label=DESIGNED)]
+        searched = [design, Case(with_feed_forward(scene, "tip"), "optimize", label=DESIGNED)]
         result = runner.run(searched)
         if result.failures:
             failed = tuple(text for failure in result.failures for text in failure.failures)
@@ -93,17 +94,8 @@ def _design(scene: Scene, designs: Sequence[Path]) -> Design:
     """Return the arms' design; raise InputError where the motion has no feed-forward."""
     if len(designs) > 1:
         raise InputError(f"--design: expected one file with compare motions, found {len(designs)}")
-    with_kind(scene, "tip")
+    with_feed_forward(scene, "tip")
     return [*given_designs(scene, designs).values()][-1]
-
-
-def with_kind(scene: Scene, kind: str) -> Scene:
-    """Return the scene with feed-forward of a kind, of its control, too."""
-    data = scene.to_tree()
-    data["feed_forward"] = data["feed_forward"] | {"kind": kind} if kind != "none" else {}
-    if scene.control is not None and scene.control.feed_forward in ("rigid", "tip"):
-        data["control"]["feed_forward"] = "tip" if kind == "tip" else "rigid"
-    return scene_from_dict(data, scene.source)
 
 
 def machines(scene: Scene) -> dict[str, str]:
@@ -122,8 +114,11 @@ def machines(scene: Scene) -> dict[str, str]:
 def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list[Motion]:
     """Return the motions with the first design, and feed-forward with the second (root only)."""
     first, *second = designs
-    rigid, forward = _judged(with_kind(scene, "none")), _judged(with_kind(scene, "tip"))
-    motions = [Motion(Case(rigid, "simulate", first, RIGID), finer=finer_deviation(rigid, first))]
+    rigid, forward = (
+        _judged(with_feed_forward(scene, "none")),
+        _judged(with_feed_forward(scene, "tip")),
+    )
+    motions = [Motion(Case(rigid, "simulate", first, RIGID), finer=_finer_deviation(rigid, first))]
     frequency, damping_ratio = build_system(rigid, _bodies(rigid, first)).slowest_vibration(2)
     if frequency > 0.0 and scene.motion.table_ends == "rest":
         for kind, label in SHAPERS.items():
@@ -132,7 +127,7 @@ def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list
             motions.append(Motion(Case(shaped, "simulate", first, label), shaper.longer))
     for label, design in zip((FORWARD, DESIGNED), (first, *second), strict=False):
         case = Case(forward, "simulate", design, label)
-        motions.append(Motion(case, 2.0 * forward.lead, finer_deviation(forward, design)))
+        motions.append(Motion(case, 2.0 * forward.lead, _finer_deviation(forward, design)))
     return motions
 
 
@@ -143,25 +138,18 @@ def _judged(scene: Scene) -> Scene:
     return scene_from_dict(data, scene.source)
 
 
-def finer_deviation(scene: Scene, design: Path | None) -> float:
-    """Return the largest deviation in a finer model that moves with this one's corrections, m.
-
-    It has twice the elastic coordinates, and geometric stiffness; nan where it is not solved.
-    """
-    data = scene.to_tree() | {"scenarios": []}
-    here, held = scene_from_dict(data, scene.source), None
-    if isinstance(here.reduction.coordinates, str):
-        return math.nan
-    data["reduction"]["coordinates"] = 2 * here.reduction.coordinates
-    data["simulation"]["stiffening"] = True
-    there, profile = scene_from_dict(data, scene.source), Profile()
-    try:
-        if here.feed_forward.on:
-            held = simulate(here, _bodies(here, design), profile).feed_forward
-        moved = simulate(there, _bodies(there, design), profile, feed_forward=held)
-    except ConvergenceError:
-        return math.nan
-    return moved.max_deviation[0]
+def _finer_deviation(scene: Scene, design: Path | None) -> float | None:
+    """Return the largest deviation in a finer model with this one's corrections, m."""
+    place = arms_with_design(MPI.COMM_SELF, scene, design, Profile())
+    if isinstance(scene.reduction.coordinates, str):
+        return None
+    held = None
+    if scene.feed_forward.on:
+        nominal = simulated_with(scene, *place)
+        if nominal is None:
+            return None
+        held = nominal.feed_forward
+    return finer_deviation(scene, *place, held)
 
 
 def _bodies(scene: Scene, design: Path | None) -> list[ShapeIntegrals]:
@@ -226,7 +214,7 @@ def _cells(scene: Scene, motion: Motion, outcome: Outcome) -> dict[str, Any]:
         "mass [kg]": summary.get("designed_mass", math.nan),
         "longer by [s]": motion.longer,
         DEVIATION: 1e3 * outcome.max_deviation,
-        "finer model [mm]": 1e3 * motion.finer,
+        "finer model [mm]": math.nan if motion.finer is None else 1e3 * motion.finer,
         "settling [mm]": 1e3 * summary.get("settling", math.nan),
     }
     for name, result in zip(machines(scene), summary.get("scenarios", ()), strict=False):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from exact_beams import Beam, TwoBeams
@@ -114,6 +116,48 @@ def test_against_geometrically_exact_beams() -> None:
     assert np.linalg.norm(left, axis=1).max() < 0.003 * largest
 
 
+LINK = """
+name = "flexible link"
+material = { young_modulus = 70e9, poisson_ratio = 0.0, density = 2700.0 }
+arms = [{ name = "link", length = 1.0, height = 0.02, thickness = 0.005, cells = [200, 4] }]
+motion = { path = "joints", file = "link.csv", law = "septic", base = "fixed", horizon = 0.4 }
+payload.mass = 0.0
+damping.stiffness_proportional = 0.0
+feed_forward = { kind = "tip", lead = 0.1 }
+simulation = { stiffening = false, tolerance = 1e-5 }
+reduction.coordinates = 8
+objective.kind = "compliance"
+design = { filter_radius = 0.0, volume_fraction = 1.0 }
+"""
+
+
+def test_against_the_inverse_of_a_flexible_link(tmp_path) -> None:
+    """The tip of one beam turns by 0.02 rad and rests: inverse dynamics over the frequencies.
+
+    Of beams turned at one end, with b^4 = w^2 rho A L^4 / E I, the joint is b (1 + cos b cosh b) /
+    (sin b + sinh b) times the tip over the length, and the tip held the beam has the rates
+    +- 2 g^2 / L^2 (E I / rho A)^1/2, tan g = -tanh g (Bayo 1987, doi:10.1002/rob.4620040106).
+    Found: 0.05 % of the largest correction apart, the slowest rate by 0.1 %.
+    """
+    (tmp_path / "link.csv").write_text("link\n0.0\n0.02\n")
+    (tmp_path / "link.toml").write_text(LINK)
+    model = Model(tmp_path / "link.toml", "motion.duration=0.25")
+    found = model.simulate(model.uniform(1.0)).trajectory
+    speed = 0.02 * np.sqrt(70e9 / 2700.0 / 12.0)  # (E I / rho A)^1/2, m2/s
+    assert slowest_unstable_rate(found.feed_forward) == pytest.approx(2 * 2.36502**2 * speed, 2e-3)
+    t = np.arange(-1.0, 1.0, 1e-4)
+    septic = np.poly1d([-20.0, 70.0, -84.0, 35.0, 0.0, 0.0, 0.0, 0.0]).deriv(2)
+    acceleration = np.where((t > 0.0) & (t < 0.25), 0.02 * septic(t / 0.25) / 0.25**2, 0.0)
+    w = 2.0 * np.pi * np.fft.rfftfreq(len(t), 1e-4)[1:]
+    b = np.sqrt(w / speed)
+    joint = b * (1.0 / np.cosh(b) + np.cos(b)) / (np.sin(b) / np.cosh(b) + np.tanh(b))
+    bend = np.fft.rfft(acceleration)[1:] * (joint - 1.0) / -(w**2)
+    corrections = np.fft.irfft(np.append(0.0, bend), len(t))
+    own = found.feed_forward.corrections.at(t[t > -0.1][:4000] + 0.1)[0][:, 0]
+    apart = (own - own[0]) - (corrections - corrections[0])[t > -0.1][:4000]
+    assert np.abs(apart).max() < 2e-3 * np.abs(corrections).max()
+
+
 @pytest.mark.parametrize(
     ("scene", "share", "changes"),
     [
@@ -159,6 +203,23 @@ def test_under_control(plain) -> None:
     found = small(TIP, "control.stiffness=[1e6,2e5,1e5]", "control.damping=[2e3,5e2,2e2]", *told)
     assert found.max_deviation[0] < 1e-3 * plain.max_deviation[0]
     assert not found.solution.is_marched  # it begins from the motion that the forces are made for
+
+
+def test_what_the_summary_tells(tmp_path, plain) -> None:
+    """What a finer model leaves, and what drives take without feed-forward."""
+    told = TIP, "simulation.tolerance=1e-3", "motion.horizon=2.0"
+    model = Model(ROOT / "demos" / "controlled_two_arm.toml", *SMALL, *told[1:])
+    without = model.simulate(model.uniform(0.5)).trajectory
+    model = Model(
+        ROOT / "demos" / "controlled_two_arm.toml", *SMALL, *told, 'control.feed_forward="tip"'
+    )
+    model.simulate(model.uniform(0.5)).save(tmp_path / "out")
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())["feed_forward"]
+    assert found["deviation_left"] < found["deviation_left_finer"]
+    assert found["deviation_left_finer"] < 0.05 * found["deviation_without"]
+    assert found["deviation_without"] == pytest.approx(without.max_deviation[0], rel=1e-3)
+    drives = without.drives[0][without.scene.driven_columns]
+    assert [*found["drive_peak_without"].values()] == pytest.approx(drives, rel=1e-3)
 
 
 def test_short_leads_are_told(moved) -> None:
