@@ -34,7 +34,9 @@ def conclude(result: Result, summary: Summary, folder: Path, verbose: bool = Fal
     )
     seconds = summary["seconds"]["total"]
     click.echo(f"{summary['name']}: {ending}, {seconds:.1f} s; results in {folder}")
-    for line in (_objective(result, summary), _largest(summary), *_limits(result.limits)):
+    # Uniform arms with solid ends exceed their volume: an optimisation begins by taking that away.
+    limits = [o for o in result.limits if result.optimised or o.quantity != "volume_fraction"]
+    for line in (_objective(result, summary), _largest(summary), *_limits(limits)):
         click.echo(f"  {line}")
     for line in _details(summary) if verbose else ():
         click.echo(f"  {line}")
@@ -115,8 +117,6 @@ def _objective(result: Result, summary: Summary) -> str:
         how = "weighted sum" if scene.objective.scenarios == "sum" else "worst"
         name += f" ({how} of {len(scene.scenarios)} scenarios)"
     text = with_unit(f"{name} {value:.4g}", response.unit)
-    if scene.objective.kind == "mass" and "designed_mass" in summary:
-        text += f" ({summary['designed_mass']:.4g} kg of it designed)"
     if response.stands_for:
         frequencies = summary["loaded_frequency"].items()
         shown = ", ".join(f"{arm} {item:.4g} {response.limit_unit}" for arm, item in frequencies)

@@ -69,9 +69,10 @@ class MaterialResponse(Response):
 
 @response("mass")
 class Mass(MaterialResponse):
-    """sum_e rho_e V_e of all arms, kg; rigid ones and those from files add what they have.
+    """sum_e rho_e V_e, kg, rho_e by the interpolation law, without motors and payload.
 
-    rho_e by the interpolation law. Motors and payload, which no design changes, are left out.
+    As objective of the arms that have a design. As limit of all arms: rigid ones and those from
+    files add what they have.
     """
 
     def per_volume(self, state: DesignState) -> tuple[np.ndarray, np.ndarray | float]:
@@ -79,9 +80,11 @@ class Mass(MaterialResponse):
         return state.solid.density * state.material.mass, state.density_slope
 
     def measure(self, analysis: Analysis) -> Measured:
-        """Return the mass of all arms (collective)."""
+        """Return the mass (collective)."""
         scene = analysis.scene
-        fixed = [place for place, owner in enumerate(scene.owners) if owner is None]
+        # Beside the rest of a robot what an optimisation gains would look like nothing.
+        owners = scene.owners if self.limited else ()
+        fixed = [place for place, owner in enumerate(owners) if owner is None]
         rest: float = on_root(
             analysis.partition.world, lambda: sum(float(fixed_body(scene, k).mass) for k in fixed)
         )

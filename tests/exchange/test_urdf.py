@@ -344,6 +344,14 @@ def test_geometry_that_is_no_solid(shapes, words):
         cells_between_joints(shapes(), SPAN)
 
 
+def test_walls_thinner_than_cells_are_told():
+    """A box with walls of 4 mm; solid ones have none."""
+    inside = inverted(bar((0.412, 0.092, 0.072)))
+    found = cells_between_joints(one_file(bar((0.42, 0.1, 0.08)), inside), SPAN)
+    assert found.side > 0.004
+    assert "walls, about 4 mm" in found.done[-1] and "arms.hollow" in found.done[-1]
+
+
 def test_visual_geometry_where_the_collision_one_is_no_solid(tmp_path, capsys):
     """A mesh in mm, turned inwards, found in its package."""
     folder = tmp_path / "ws" / "my_robot" / "meshes"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -164,6 +164,14 @@ class _Pieces:
         every = np.array([one.bounds for one in (*self.closed, *self.open)])
         return np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
 
+    @property
+    def wall(self) -> float:
+        """Mean thickness of what is between surfaces, 2 V / A, m: of a hollow link, of its wall."""
+        if not self.closed:
+            return np.inf
+        volume = sum(one.volume for one in self.closed) - sum(one.volume for one in self.hollows)
+        return float(2.0 * volume / sum(one.area for one in (*self.closed, *self.hollows)))
+
     def on(self, grid: _Grid) -> np.ndarray:
         """Return True for the voxels within the geometry."""
         result = np.zeros(grid.shape, dtype=bool)
@@ -253,9 +261,19 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
         side = (piece.volume / count) ** (1.0 / 3.0)
         cells = _cells(pieces, piece.box, ends, side, body.length, notes)
         if cells is not None:
-            return cells
+            return replace(cells, done=(*cells.done, *_thin_walls(pieces, cells)))
         count = round(1.5 * count)
     raise NoSolid(f"its walls are too thin for {MOST} cells")
+
+
+def _thin_walls(pieces: _Pieces, cells: LinkCells) -> list[str]:
+    """Return that walls are thinner than cells, which then lose pieces and volume."""
+    if pieces.wall >= cells.side:
+        return []
+    return [
+        f"its walls, about {1e3 * pieces.wall:.2g} mm, are thinner than its cells of "
+        f"{1e3 * cells.side:.2g} mm, which lose part of them: arms.hollow is made for such links"
+    ]
 
 
 # -- pieces ----------------------------------------------------------------------------------

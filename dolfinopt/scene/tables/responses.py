@@ -180,7 +180,7 @@ DECLARED: dict[str, Declaration] = {
     for item in (
         Declaration(
             "mass",
-            "mass of the arms",
+            "mass of the designed arms",
             "kg",
             frozenset(),
             Limited("upper limit of the mass of all arms together [kg]", Mass),
