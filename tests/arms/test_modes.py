@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,9 +9,8 @@ import pytest
 import scipy.linalg
 from bodies import changed, random_chain, random_tree
 from mpi4py import MPI
-from remainders import Field, arm_of, build, dense_matrices, rates, uneven, wave
+from remainders import Field, arm_of, dense_matrices, wave
 from runs import TWO_ARM
-from scipy.optimize import brentq
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -21,7 +18,6 @@ from dolfinopt.arms.modes import FrozenTree, LoadedModes, loaded_modes
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.responses.frequency import Eigenfrequency
-from dolfinopt.responses.sensitivity import period_gradient
 
 
 def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
@@ -35,7 +31,7 @@ def test_carried_inertia_of_a_frozen_machine(d: int) -> None:
     """What body 1 carries is what its rows feel of the others, which are held."""
     rng = np.random.default_rng(7)
     machine = random_tree(rng, interfaces=2) if d == 3 else random_chain(rng, 3)
-    mechanism = machine.mechanism()
+    mechanism = machine.mechanism
     pose = RigidMotion(*rng.normal(size=(3, 1, mechanism.num_rigid)))
     size, own = mechanism.num_coordinates, mechanism.slices[1]
     rest = np.zeros((1, size))
@@ -64,18 +60,6 @@ def test_carried_inertia_of_a_frozen_machine(d: int) -> None:
             after = FrozenTree(other, pose, kind).carried()[1]
             found = np.sum(getattr(by, name) * change)
             assert found == pytest.approx(np.sum(weights * (after - before)), rel=1e-9, abs=1e-12)
-
-
-def test_rigid_body_of_a_bar() -> None:
-    """Solid, and with the outer half empty; Gmsh places nodes to 1e-12 of the length."""
-    arm = arm_of((20, 2), "interpolation.floor=1e-12")
-    for share in (1.0, 0.5):
-        body = arm.state(np.where(arm.mesh.centroid[:, 0] < share, 1.0, 0.0)).rigid_body
-        m = 2700.0 * 0.06 * 0.01 * share
-        assert body.mass == pytest.approx(m, rel=1e-10)
-        np.testing.assert_allclose(body.w[:, 0], [0.5 * m * share, 0.0], atol=1e-10)
-        expected = m * (share**2 / 3.0 + 0.06**2 / 12.0)
-        assert body.W[0, 0, 0] == pytest.approx(expected, rel=1e-10)
 
 
 def carried_by(mass: float, x: float, y: float, inertia: float) -> np.ndarray:
@@ -145,68 +129,9 @@ def stubby() -> Arm:
     return arm
 
 
-FIRST_MOMENT = carried_by(1.0, 1.0, 0.0, -1.0) - carried_by(1.0, 0.0, 0.0, 0.0)  # 1 kg m along x
-
-
-@cache
-def coinciding() -> np.ndarray:
-    """Return what the stubby arm carries when its two lowest frequencies are equal."""
-    # They repel each other unless two numbers are right, by Newton's method: a change dM gives the
-    # pair's matrix -lambda phi' dM phi, which has to close the gap and must not mix them.
-    arm, moment, inertia = stubby(), -0.15 * MASS, 2.5 + 0.15**2 * MASS
-    for _ in range(20):
-        carried = carried_by(MASS, 0.0, 0.0, inertia) + moment * FIRST_MOMENT
-        modes = loaded_modes(arm.elastic, carried, 2, None)
-        (low, high), phi = modes.values, modes.outboard
-        if high - low < 1e-11 * high:
-            return carried
-        changes = []
-        for unit in (FIRST_MOMENT, carried_by(0.0, 0.0, 0.0, 1.0)):
-            pair = -high * phi.T @ unit @ phi
-            changes.append([pair[0, 0] - pair[1, 1], 2.0 * pair[0, 1]])
-        step = np.linalg.solve(np.transpose(changes), [high - low, 0.0])
-        moment, inertia = moment + step[0], inertia + step[1]
-    raise AssertionError((moment, inertia, low, high))
-
-
-def slopes_at(
-    arm: Arm, carried: np.ndarray, exponent: float, follow: bool
-) -> tuple[Callable[[np.ndarray], LoadedModes], np.ndarray]:
-    """Return the modes of a design, and the gradient of the squared period at the present one."""
-    start = loaded_modes(arm.elastic, carried, 3, None).start
-
-    def modes(x: np.ndarray) -> LoadedModes:
-        arm.state(x)
-        return loaded_modes(arm.elastic, carried, 3, start)
-
-    x = design_of(arm, symmetric)
-    found = modes(x)
-    _, by_values = squared_period(found, exponent, follow)
-    return modes, period_gradient(arm.current, found, by_values)[0]
-
-
 def squared_period(modes: LoadedModes, exponent: float, follow: bool) -> tuple[float, np.ndarray]:
     options = SimpleNamespace(exponent=exponent, follow=follow)
     return Eigenfrequency(options).squared_period(modes)
-
-
-@pytest.mark.serial  # ranks: test_an_arm_cut_in_two
-@pytest.mark.parametrize("exponent", [4.0, 20.0])
-@pytest.mark.parametrize("direction", [uneven, wave])
-def test_p_mean_where_modes_coincide(direction: Field, exponent: float) -> None:
-    """The gradient of equal eigenvalues is one, of either mode alone it is none: rates 2 and 1."""
-    arm, carried = stubby(), coinciding()
-    x, d = design_of(arm, symmetric), design_of(arm, direction)
-    orders = []  # with small steps, beside which the part of second order is 3 % of the first
-    for follow, steps in ((False, (1e-3, 2.5e-4)), (True, (4e-5, 1e-5))):
-        modes, slope = slopes_at(arm, carried, exponent, follow)
-
-        def value(h: float, modes=modes, follow: bool = follow) -> float:
-            return squared_period(modes(x + h * d), exponent, follow)[0]
-
-        orders.append(rates(value, float(slope @ d), steps))
-    assert orders[0] == pytest.approx(2.0, abs=0.1)
-    assert orders[1] == pytest.approx(1.0, abs=0.25)
 
 
 def test_following_a_mode_through_a_crossing() -> None:
@@ -254,40 +179,3 @@ def test_first_frequency_is_that_of_all_elements(name: str) -> None:
     expected = loaded_modes(arm.elastic, nothing, 1, None).frequency
     assert arm.current.body.first_frequency / expected - 1.0 >= excess - 1e-9
     assert arm.current.first_frequency == pytest.approx(expected, rel=1e-10)
-
-
-def euler_value(mass: float, inertia: float, height: float) -> float:
-    """Return the lowest squared frequency of Euler's beam, 1 m long, with a tip body."""
-    # w = A (cosh bx - cos bx) + B (sinh bx - sin bx), EI w_xx = s^2 J w_x, EI w_xxx = -s^2 m w.
-    bending, line = 70e9 * 0.01 * height**3 / 12.0, 2700.0 * 0.01 * height  # N m2, kg/m
-
-    def determinant(b: float) -> float:
-        ch, sh, co, si = np.cosh(b), np.sinh(b), np.cos(b), np.sin(b)
-        w, w1 = np.array([ch - co, sh - si]), b * np.array([sh + si, ch - co])
-        w2, w3 = b**2 * np.array([ch + co, sh + si]), b**3 * np.array([sh - si, ch + co])
-        load = b**4 / line
-        return float(np.linalg.det([w2 - load * inertia * w1, w3 + load * mass * w]))
-
-    grid = np.linspace(0.05, 2.0, 40)
-    first = np.flatnonzero(np.diff(np.sign([determinant(b) for b in grid])))[0]
-    root = brentq(determinant, grid[first], grid[first + 1], xtol=1e-14)
-    return root**4 * bending / line
-
-
-@pytest.mark.parametrize("key", ["eigenfrequency", "first_frequency"])
-@pytest.mark.parametrize(("mass", "inertia"), [(0.0, 0.0), (5.0, 0.0), (5.0, 0.3)])
-def test_a_motor_at_the_elbow_lowers_the_frequency(key: str, mass: float, inertia: float) -> None:
-    """Objective and limit against a slender beam with that body at its end, in closed form."""
-    light = "arms.arm2.rigid=true", "arms.arm2.mass=1e-6", "arms.arm2.inertia=0.0"
-    motor = f"arms.arm1.joint_mass={mass}", f"arms.arm1.joint_inertia={inertia}"
-    limit = key == "first_frequency"
-    asked = "constraints.first_frequency=1.0" if limit else "objective.kind=eigenfrequency"
-    none = "arms.arm2.joint_mass=0.0", "arms.arm2.joint_inertia=0.0", "payload.mass=0.0"
-    linear = "arms.arm1.height=0.02", "simulation.stiffening=false"
-    built = build(*light, *motor, *none, asked, *linear, cells=(100, 2))
-    solid = {k: np.ones(arm.mesh.num_cells) for k, arm in built.arms.items()}
-    evaluation, _ = built.evaluate(solid)
-    (found,) = evaluation.values_of("eigenfrequency")
-    expected = euler_value(mass, inertia, 0.02)
-    # Shear, the beam's own and that of its elements: measured 2.4e-4.
-    assert found == pytest.approx(np.sqrt(expected) / (2.0 * np.pi), rel=5e-4)

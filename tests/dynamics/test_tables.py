@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import Chain, beam
+from bodies import beam, plane_chain
 from machines import distance
-from scipy.integrate import trapezoid
 
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.collocation import radau_iia
@@ -32,20 +31,6 @@ def test_a_polynomial_has_its_own_values() -> None:
     np.testing.assert_allclose(found[:, 0], cubic(t), rtol=1e-12)
 
 
-def test_moments_of_a_pulse_within_a_step() -> None:
-    """int f dt and int f t dt of a step's polynomial are those of the table."""
-    method, grid = radau_iia(3), np.array([0.0, 0.4, 1.0])
-    t = np.array([0.0, *PULSE, 1.0])
-    f = np.array([0.0, 0.0, 7.0, 5.0, 0.0, 0.0])
-    values = Table(t, f[:, None]).at_stages(grid, method.c)[3:, 0]
-    weights = 0.6 * method.A[-1]
-    fine = np.linspace(0.5, 0.51, 20_001)
-    table = np.interp(fine, t, f)
-    assert weights @ values == pytest.approx(trapezoid(table, fine), rel=1e-6)
-    places = 0.4 + 0.6 * method.c
-    assert weights @ (values * places) == pytest.approx(trapezoid(table * fine, fine), rel=1e-6)
-
-
 def still(t: np.ndarray) -> RigidMotion:
     """Return no motion of cart and two joints."""
     zero = np.zeros((len(t), 3))
@@ -55,7 +40,7 @@ def still(t: np.ndarray) -> RigidMotion:
 def loaded(rows: np.ndarray) -> MachineSystem:
     """Return two arms at rest with a pulse of 400 N at the end, in a table of these rows, s."""
     arm = beam(bending=10.0, axial=300.0, damping=1e-3)
-    mechanism = Chain((arm, arm), 1.0, 0.01, (0.0, 0.0), 0.0).mechanism()
+    mechanism = plane_chain([arm.body()] * 2, 1.0, 0.01, (0.0, 0.0), 0.0)
     force = AppliedForce(site=(1, 0), column=0, in_world=True, known=False)
     mechanism = replace(mechanism, forces=(force,))
     t = np.union1d(rows, PULSE)

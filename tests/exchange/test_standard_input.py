@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import beam, random_cloud, random_tree
+from bodies import random_cloud, random_tree
 from bodies import stiffened as bent
 from readers import State, forces_of_sid, random_state
 from runs import refused
@@ -29,7 +29,6 @@ pytestmark = pytest.mark.serial  # ranks have no part in it
 
 # Sums of some dozens of products of numbers of size one; measured: 1e-15.
 ROUNDING = 1e-12
-THICKNESS = 0.02  # m
 
 
 def assert_close(found, expected, tolerance=ROUNDING, size=1.0) -> None:
@@ -94,7 +93,7 @@ def test_body_of_a_file_in_a_machine(tmp_path, stiff):
     body = random_cloud(rng, 4, 3).body()
     body = stiffened(body, 2) if stiff else body
     write_sid(tmp_path / "a.sid", to_sid(body))
-    tree = random_tree(rng).mechanism()
+    tree = random_tree(rng).mechanism
     motion, rates = RigidMotion(*rng.normal(size=(3, 5, 4))), 0.3 * rng.normal(size=(3, 5, 9))
 
     def forces(one):
@@ -121,16 +120,6 @@ def test_several_interfaces(tmp_path, stiff):
         assert np.array_equal(getattr(again, name), getattr(body, name)), name
     with refused("'tool'", "1, 3, 2"):
         from_sid(data, 3, further=["tool"])
-
-
-def test_names_hold_frequencies():
-    """sqrt(K / M) of a bar in bending and in tension; other programs read it in Hz."""
-    body = beam().body()
-    data = sid_of(body)
-    found = [float(name.split(":")[1].split("Hz")[0]) for name in data.names]
-    expected = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
-    assert found == pytest.approx(expected, abs=5e-4)  # three decimals
-    assert data.names[0].startswith("Eigen Mode    1 : ")
 
 
 def moving(body: ShapeIntegrals, s: State) -> BodyMotion:

@@ -31,11 +31,10 @@ def equations_of(rng: np.random.Generator, d: int) -> tuple[Equation, ...]:
 
 def mechanism_of(kind: str) -> Mechanism:
     rng = np.random.default_rng(5)
-    if kind == "plane":
-        return random_chain(np.random.default_rng(7), 3, bent=True).mechanism()
-    tree = random_tree(rng, interfaces=2).mechanism()
-    bodies = [stiffened(rng, one) if one.num_modes else one for one in tree.bodies]
-    return replace(tree, bodies=tuple(bodies)) if kind == "stiffened" else tree
+    machine = random_chain(rng, 3) if kind == "plane" else random_tree(rng, interfaces=2)
+    bodies = [stiffened(rng, one) if one.num_modes else one for one in machine.mechanism.bodies]
+    stiff = replace(machine.mechanism, bodies=tuple(bodies))
+    return machine.mechanism if kind == "space" else stiff
 
 
 @pytest.mark.parametrize("kind", ["plane", "space", "stiffened"])
