@@ -8,12 +8,9 @@ from machines import (
     GAINS,
     Tree,
     apart,
-    check_energy,
-    four_bar,
     machine,
     reference,
     simulated,
-    slider_crank,
     two_arm,
     with_keys,
 )
@@ -98,29 +95,6 @@ def test_friction_while_a_joint_turns_round() -> None:
     assert error < 1e-5  # 2e-7
 
 
-def loop(tree: Tree) -> Tree:
-    """Return a closed loop of soft bars under gravity."""
-    tree["material"]["young_modulus"] *= 0.1
-    keys = {"simulation": {"tolerance": 1e-6}, "reduction": {"coordinates": 3}}
-    return with_keys(tree, {**keys, "motion": {**STRONG, "horizon": 0.1}})
-
-
-SCENES = {
-    "prescribed": lambda: arms(False),
-    "prescribed, stiffened": lambda: arms(True),
-    "controlled": lambda: arms(False, control=GAINS),
-    "controlled, stiffened": lambda: arms(True, control=GAINS),
-    "slider": lambda: loop(slider_crank(0.012, (20, 3))),
-    "pin": lambda: loop(four_bar((20, 3))),
-}
-
-
-@pytest.mark.parametrize("kind", SCENES)
-def test_work_under_gravity_is_energy(kind: str) -> None:
-    """Drive work = kinetic + strain + potential energy + what damping took."""
-    check_energy(simulated(SCENES[kind]()), 1e-8)  # measured 2e-11 at most
-
-
 def test_stiff_springs_are_rigid_drives() -> None:
     """The motors' inertia acts on the joints then; the rest falls with the spring's softness."""
     rigid = machine(simulated(small(ROTORS, motion=EARTH)))[0]
@@ -132,25 +106,6 @@ def test_stiff_springs_are_rigid_drives() -> None:
         left.append(apart(soft.deviation, rigid.deviation))
     assert left[0] / left[1] == pytest.approx(10.0, rel=0.05)
     assert left[1] < 5e-3  # the joints' own springs are a thousandth of this
-
-
-def test_motors_on_the_desired_motion_move_their_rotors() -> None:
-    """Without control the drives give what the springs take, and what the rotors' inertia does.
-
-    The cart carries the only rotor, whose own moment turns nothing.
-    """
-    motions = []
-    for one in (0.0, 2e-5):
-        tree = small(SOFT | ROTORS | {"rotor_inertia": 0.0}, control=None)
-        tree["arms"][0]["rotor_inertia"] = one
-        motions.append(simulated(tree).trajectory)
-    light, heavy = motions
-    np.testing.assert_array_equal(heavy.deviation, light.deviation)  # the arms do not feel it
-    change = heavy.joint_forces - light.joint_forces
-    expected = 2e-5 * 100.0**2 * heavy.desired.qdd
-    expected[:, [0, 2]] = 0.0  # the cart is prescribed, and moved by what the arms do
-    size = np.abs(heavy.joint_forces).max()
-    np.testing.assert_allclose(change, expected, rtol=0, atol=1e-12 * size)
 
 
 def test_angles_of_motors_are_written(tmp_path) -> None:

@@ -62,18 +62,3 @@ def test_three_cranks(tmp_path) -> None:
     assert largest == pytest.approx([7.6, 7.6], abs=0.1)
     # What closing 9 um would take is told, not summed in.
     assert system.left_stress() == pytest.approx(8060.0, rel=0.01)
-
-
-def test_forces_of_least_norm_are_smooth(tmp_path) -> None:
-    """Multipliers of rigid arms solve the joints' rows with the least norm at every instant."""
-    trajectory, system = moved(tmp_path, TURN, bennett(), 1.0)
-    desired, none = trajectory.desired, np.zeros((len(trajectory.t), 0))
-    forces = inverse_dynamics(system.rigid, desired, none, none, none)[1]
-    here = system.loops.at(system.rigid, desired.q, none)
-    dependent = system.drives.dependent
-    found = here.closing(forces, dependent)
-    left = forces[:, dependent] - here.generalised_force(found)[:, dependent]
-    assert np.abs(left).max() < 1e-10 * np.abs(forces).max()
-    J = here.jacobian[:, :, dependent]
-    range_of = np.einsum("nkd,ndj,nj->nk", J, np.linalg.pinv(J), found)
-    assert np.abs(range_of - found).max() < 1e-10 * np.abs(found).max()

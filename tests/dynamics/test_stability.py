@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse
-from machines import distance, energies
-from mpi4py import MPI
-from remainders import Built, Field, arm_of, build, built_of, taylor, uneven, wave
-from runs import TWO_ARM, overrides, run, scene, summary_of
+from machines import distance
+from remainders import Built, Field, arm_of, build, uneven, wave
+from runs import TWO_ARM, overrides, run, summary_of
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
-from dolfinopt.dynamics import measured, radau
+from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import relative_error
-from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import rounding_error
 from dolfinopt.fem.measured import ROUNDING_ERROR_LIMIT
@@ -30,7 +27,6 @@ from dolfinopt.reduction.eigenproblem import Pencil, lowest_eigenpairs
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
-NAMED = (InputError, ConvergenceError)
 EXTENDED = pytest.mark.skipif(
     np.finfo(np.longdouble).eps > 1e-18, reason="long double is no longer than double here"
 )
@@ -273,26 +269,6 @@ def test_motions(overrides: list[str]) -> None:
     assert distance(trajectory.problem, trajectory.solution, fine, 5000) < 1.1e-4
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        ["payload.mass=1e4", "motion.horizon=1.9"],
-        ["material.young_modulus=1e3"],
-        ["material.young_modulus=1e6", "motion.horizon=1.9"],
-    ],
-    ids=" ".join,
-)
-def test_motions_beyond_small_deflections_are_refused(overrides: list[str]) -> None:
-    """By the deflection and what to change, in one line, whether Newton's method converges."""
-    # The lightest of them bends an arm by 54 % of its length before Newton's method fails.
-    with pytest.raises(ConvergenceError) as refusal:
-        moved(*overrides)
-    said = str(refusal.value)
-    deflection = re.search(r"deflects by ([0-9.]+) % of its length: beyond 50 %", said)
-    assert deflection is not None and float(deflection[1]) > 100.0 * measured.DEFLECTION_LIMIT
-    assert "material.young_modulus" in said and "motion.duration" in said and "\n" not in said
-
-
 def quasi_static(problem: MachineSystem, t: np.ndarray) -> np.ndarray:
     """Return K^-1 (- rows of the undeformed mechanism) at instants t."""
     rest = np.zeros((len(t), problem.mechanism.num_coordinates))
@@ -310,52 +286,6 @@ def test_stiff_arms_follow_their_loads(young_modulus: float) -> None:
     q = solution.sample(t) + 2e-4 * solution.sample(t, 1)
     static = quasi_static(trajectory.problem, t)
     assert relative_error(trajectory.mechanism, q - static, static) < 2e-4 + 6e11 / young_modulus
-
-
-def test_vibrations_of_megahertz() -> None:
-    """Arms of a centimetre with 40 coordinates, undamped: the motion of those with 8."""
-    small = ["arms.length=0.01", "arms.height=2e-3", "arms.thickness=1e-3", "payload.mass=1e-3"]
-    small += ["motion.radius=0.01", "motion.joint_height=-5e-3", "motion.duration=0.05"]
-    small += ["motion.horizon=0.06", "simulation.sample=1e-4"]
-    small += ["damping.stiffness_proportional=0.0"]
-    few, many = (moved(*small, f"reduction.coordinates={q}", cells=(40, 6)) for q in (8, 40))
-    body = many.mechanism.bodies[0]
-    highest = scipy.linalg.eigh(body.K, body.M, eigvals_only=True)[-1]
-    assert np.sqrt(highest) / (2.0 * np.pi) > 1e6
-    assert np.isfinite(many.joint_forces).all()
-    scale = np.abs(many.deviation).max()
-    np.testing.assert_allclose(many.deviation / scale, few.deviation / scale, atol=1e-3)
-
-
-def test_undamped_energy_does_not_drift() -> None:
-    """13 s after the motion the arms still vibrate with the energy they were left with."""
-    undamped = "damping.stiffness_proportional=0.0"
-    trajectory = moved(undamped, "motion.horizon=15.0")
-    kinetic, strain, _ = energies(trajectory, np.linspace(2.0, 15.0, 27))
-    left = kinetic + strain
-    # The error is relative to the largest deflection, that of the motion itself: 30 times those
-    # that remain. Twice it, as energy is of second order, in the worst phase.
-    largest = 0.5 * trajectory.compliance.sum(axis=1).max()
-    assert np.ptp(left) < 4e-4 * np.sqrt(largest * left[0])
-    assert left[0] > 1e-6 * largest
-
-
-@pytest.mark.slow
-def test_designs_of_modal_truncation_with_many_coordinates() -> None:
-    """Void tips that four modes do not see, undamped: arms that fold over are solved, and right."""
-    linear, quick = "arms.element=linear", ("arms.cells=[48,6]", "simulation.tolerance=1e-3")
-    few = "reduction.method=modal", "optimizer.max_iterations=15", "design.filter_radius=0.03"
-    x_phys = do.optimize(scene(linear, *quick, *few), world=MPI.COMM_SELF).x_phys
-    many = "reduction.coordinates=12", "damping.stiffness_proportional=0.0", "motion.horizon=2.0"
-    trajectory = moved(linear, *many, field=lambda k, x, y: x_phys[k], cells=(48, 6))
-    assert trajectory.interface_rotations.max() > 0.15  # far from small
-    problem, found = trajectory.problem, trajectory.solution
-    fine = radau.integrate(problem, 1e-5, 5, do.Profile())
-    assert distance(problem, found, fine, 5000) < 1e-4
-    # Long steps damp vibrations out by any number of stages: the estimate must know of them.
-    for stages in (3, 4, 5):
-        rough = radau.integrate(problem, 1e-2, stages, do.Profile())
-        assert distance(problem, rough, found, 5000) < 1e-2
 
 
 MILLIMETRES = [  # mm, t, s, N
@@ -400,19 +330,6 @@ def test_millimetres_and_tonnes(overrides, in_metres, in_millimetres) -> None:
         np.testing.assert_allclose(mm_slopes[k] / factor, slopes, atol=3e-6 * scale)
 
 
-def test_deflections_count_what_bending_shortens() -> None:
-    """A beam bent by w at its tip gets shorter by 3 w^2 / 5 L, w' = 3 w (2 x - x^2) / 2 L."""
-    built = build("simulation.stiffening=true", cells=(60, 3))
-    trajectory = built.evaluate(built.fields(DESIGNS["solid"]))[1]
-    mechanism, body = trajectory.mechanism, trajectory.mechanism.arms[0]
-    bent = np.linalg.solve(body.K, body.outboard[1])
-    w = 0.4 * mechanism.constants[0].points[0, 0]
-    q = np.zeros((1, mechanism.num_coordinates))
-    q[0, mechanism.slices[0]] = w * bent / (body.outboard[1] @ bent)
-    share = mechanism.deflections(q)[0][0]
-    assert share == pytest.approx(np.hypot(0.4, 0.6 * 0.4**2), rel=2e-3)
-
-
 def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
     """A tenth of an arm's length: in summary.json and on standard error, arm by arm."""
     heavy = ["payload.mass=40", "arms.arm2.young_modulus=1e12"]
@@ -431,77 +348,3 @@ def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
     deflection, stiffening = warnings
     assert f"'arm1' deflects by {100.0 * ratio:.3g} %" in deflection
     assert "simulation.stiffening = false" in stiffening
-
-
-LAWS = ["two-material", "simp", "pedersen", "du-olhoff", "ramp"]
-METHODS = ["craig-bampton", "modal", "krylov", "balanced"]
-KINDS = ["esl", "integral_compliance", "deviation", "static", "eigenfrequency"]
-JOINTS = "t,cart,{arms}\n0,0,{a}\n0.6,0.2,{b}\n1,0.1,{c}\n"
-
-
-def drawn(rng: np.random.Generator, folder: Path) -> dict:
-    """Draw a scene of one to four arms."""
-
-    def one(*choices: object) -> Any:
-        return choices[rng.integers(len(choices))]
-
-    count = int(rng.integers(1, 5))
-    cells = [int(rng.integers(8, 24)), int(rng.integers(1, 4))]
-    arms: list[dict] = [{"name": f"a{k}", "height": rng.uniform(0.04, 0.12)} for k in range(count)]
-    arms[0] |= {"length": 1.6 / count, "thickness": 0.01, "cells": cells, "passive": one(0.0, 0.06)}
-    if rng.random() < 0.2:
-        del arms[0]["cells"]
-        arms[0] |= {"mesh": "meshes/arm_bores.geo", "mesh_size": 0.04, "height": 0.12}
-    if count > 1 and rng.random() < 0.5:
-        arms[-1] |= one({"rigid": True}, {"design": "a0", "height": arms[0]["height"]})
-    motion: dict = {"duration": rng.uniform(1.0, 2.0), "gravity": one([0.0, 0.0], [0.5, -9.81])}
-    motion["horizon"] = motion["duration"] + 0.3
-    if rng.random() < 0.4:
-        names = ",".join(f"a{k}" for k in range(count))
-        rows = {c: ",".join(f"{v:.3f}" for v in rng.uniform(-1.5, 1.5, count)) for c in "abc"}
-        (folder / "joints.csv").write_text(JOINTS.format(arms=names, **rows))
-        motion |= {"path": "joints", "file": str(folder / "joints.csv"), "duration": 1.0}
-    else:
-        motion |= {"path": "arc", "radius": rng.uniform(0.5, 1.0), "law": one("quintic", "septic")}
-        motion |= {"flattening": rng.uniform(0.0, 1.0), "joint_height": one(-0.4, -0.1)}
-    return {
-        "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
-        "interpolation": {"law": one(*LAWS), "floor": one(1e-3, 1e-6, 1e-12)},
-        "arms": arms,
-        "motion": motion,
-        "payload": {"mass": one(0.0, 1.0, 6.0), "inertia": one(0.0, 0.1)},
-        "damping": {"stiffness_proportional": one(0.0, 2e-4, 1e-2)},
-        "reduction": {"method": one(*METHODS), "coordinates": int(rng.integers(3, 9))},
-        "objective": {"kind": one(*KINDS), "load_cases": 5, "gradient": one("esl", "exact")},
-        "simulation": {"tolerance": one(1e-3, 1e-5)},
-        "design": {"filter_radius": one(0.0, 0.03)},
-    }
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("seed", range(24))  # 24 takes 90 s
-def test_any_scene(seed: int, tmp_path: Path) -> None:
-    """Finite, and of second-order remainders along all directions; or a named error of one line."""
-    # From finer steps than the command's: at random designs of undamped arms the remainder's cubic
-    # part outweighs its square at 0.01. A direction whose remainders are all rounding shows
-    # nothing.
-    rng = np.random.default_rng(seed)
-    data = drawn(rng, tmp_path)
-    crisp = rng.random() < 0.25
-
-    def design(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        grey = 0.55 + 0.35 * uneven(k, x, y)
-        return np.where(grey > 0.55, 1.0, 0.0) if crisp else grey
-
-    try:
-        built = built_of(do.scene_from_dict(data, source=f"scene {seed}"))
-        evaluation, trajectory = built.evaluate(built.fields(design))
-        slopes = built.gradient(trajectory)
-        assert np.isfinite(evaluation.objective) and evaluation.objective > 0.0
-        assert all(np.isfinite(values).all() for values in slopes.values())
-        if not crisp and (trajectory is None or built.scene.objective.gradient == "exact"):
-            test = taylor(built.scene, design, tuple(0.00125 / 4.0**k for k in range(3)))
-            assert test.passed, (data, test)
-    except NAMED as error:
-        assert "\n" not in str(error)
