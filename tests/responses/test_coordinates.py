@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import Built, build, built_of, wave
+from remainders import Built, build, wave
 from runs import TWO_ARM, overrides, refused, run, summary_of
 
 import dolfinopt as do
@@ -18,7 +18,6 @@ from dolfinopt.optimization import assessment, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.responses import order_selection as coordinates
 from dolfinopt.responses.order_selection import Comparison, OrderSelection
-from dolfinopt.study.cases import simulate_scenarios
 
 WORLD = MPI.COMM_WORLD
 AUTO = 'reduction.coordinates="auto"'
@@ -114,30 +113,6 @@ def test_estimate_is_the_error(name, method, overrides):
     assert estimate == pytest.approx(max(worst), rel=0.1)
 
 
-@pytest.mark.serial  # ranks: test_any_number_of_ranks
-def test_scenarios_count():
-    """The worst of them, each posed by itself."""
-    heavy = "payload.mass=9"
-    built = auto(f"scenarios=[{{changes=['{heavy}', 'material.young_modulus=60e9']}}]")
-    alone = auto(heavy, "material.young_modulus=60e9"), auto()
-    x = built.fields(wave)
-    parts = [error(one, x, 4) for one in alone]
-    # Steps are those of the scene that needs most: right to TIME_SHARE of the tolerance.
-    assert error(built, x, 4) == pytest.approx(max(parts), rel=0.02)
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_motions_are_compared_at_the_same_instants():
-    """Where the richer one is looked at half as often: the instants of the other."""
-    built = auto()
-    parts = built.scene, built.partition, built.arms, built.fields(wave), built.profile
-    comparison = coordinates.Comparison(*parts)
-    found = comparison.error(4)
-    if (one := comparison.motion) is not None:
-        comparison.motion = one.at(one.t[::2])
-    assert comparison.error(4) == pytest.approx(found, rel=1e-12)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "tolerance"),
@@ -165,20 +140,6 @@ def test_fewest_that_meet_the_tolerance(overrides, tolerance):
         assert arm.reduce(x[k]).num_modes == choice.coordinates
 
 
-@pytest.mark.serial  # ranks: test_any_number_of_ranks
-def test_shared_design_counts_like_two():
-    """Two arms of one design err as if each had its own."""
-    shared, own = auto("arms.arm2.design=arm1"), auto()
-    found = [error(b, b.fields(lambda k, *at: wave(0, *at)), 4) for b in (shared, own)]
-    assert found[0] == pytest.approx(found[1], rel=1e-9)
-
-
-def test_three_arms():
-    changes = AUTO, "arms.cells=[24,3]", "reduction.tolerance=1e-2", "motion.horizon=1.9"
-    built = built_of(do.load_scene(TWO_ARM.parent / "three_arm.toml", changes))
-    assert choose(built, {k: arm.uniform(0.5) for k, arm in built.arms.items()}).error <= 1e-2
-
-
 def test_a_given_number_costs_nothing():
     built = build("reduction.coordinates=5", SHORT)
     before = replace(built.profile.counts)
@@ -186,14 +147,6 @@ def test_a_given_number_costs_nothing():
     assert do.choose_coordinates(*place) is None
     assert built.profile.counts == before
     assert all(arm.coordinates == 5 and arm.basis is None for arm in built.arms.values())
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_more_coordinates_than_dofs_are_not_tried():
-    """2 x 1 cells: 2 dofs at each of two free nodes and 3 of the interface, 7 in all: exact."""
-    built = auto("payload.mass=0.1", "motion.horizon=1.9", tolerance=1e-5, cells=(2, 1))
-    choice = choose(built, built.fields(wave))
-    assert choice.coordinates <= 7
 
 
 def test_none_is_enough(monkeypatch):
@@ -270,15 +223,6 @@ def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
         assert "estimated error of 0.02, above reduction.tolerance = 0.01" in warning
 
 
-@pytest.mark.serial  # ranks: test_any_number_of_ranks
-def test_cases():
-    """Every scene has its own choice: a light payload shakes the arms more than a heavy one."""
-    scenes = [small(f"payload.mass={mass}") for mass in (0.5, 9.0)]
-    light, heavy = (one.choice.coordinates for one in simulate_scenarios(scenes, None))
-    (alone,) = simulate_scenarios(scenes[1:], None)
-    assert light > heavy == alone.choice.coordinates
-
-
 @pytest.mark.serial
 def test_commands(tmp_path, capsys):
     """Each says what it chose; a picture drawn anew takes the number from the summary."""
@@ -300,14 +244,3 @@ def test_commands(tmp_path, capsys):
     assert chosen in said("export", TWO_ARM, "--out", tmp_path / "e")
     assert sentence in said("gradient", TWO_ARM, "--out", tmp_path / "g.npz")
     assert scene_of(tmp_path / "s").reduction.coordinates == found["coordinates"]
-
-
-@pytest.mark.serial
-def test_arm_from_a_file(tmp_path):
-    """It keeps the coordinates that the file has; the other's are chosen."""
-    run("export", TWO_ARM, "--out", tmp_path, "--set", "arms.cells=[24,3]")
-    built = auto(f"arms.arm1.sid={tmp_path / 'arm1.sid'}", tolerance=1e-3)
-    choice = choose(built, built.fields(wave))
-    _, trajectory = built.evaluate(built.fields(wave))
-    sizes = [body.num_modes for body in trajectory.mechanism.bodies]
-    assert sizes == [4, choice.coordinates]

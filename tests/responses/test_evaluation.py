@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import asdict, fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
-from mpi4py import MPI
-from remainders import arm_of, beside_volume, build, built_of, rates, tip, uneven, wave
+from remainders import beside_volume, build, built_of, rates, tip, uneven, wave
 from runs import TWO_ARM, refused
 
 import dolfinopt as do
-from dolfinopt.arms.arm import chain_of
-from dolfinopt.dynamics.collocation import Solution, radau_iia
-from dolfinopt.dynamics.response_instants import response_instants
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.multibody.shape_integrals import rigid_bar
 from dolfinopt.responses.evaluation import constraint_gradients
 from dolfinopt.responses.motion import motion_objective
-
-WORLD = MPI.COMM_WORLD
 
 
 def same(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -89,20 +82,6 @@ def test_a_rigid_arm_is_the_limit_of_stiff_ones() -> None:
         gaps.append(np.abs(gap))
     assert (gaps[1] < 2e-2).all()
     np.testing.assert_allclose(np.log10(gaps[0] / gaps[1]), 1.0, atol=0.15)
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_a_rigid_bar_is_the_solid_arm() -> None:
-    """Mass, centre and inertia of the meshed solid bar, with the arm's own density."""
-    built = build("arms.arm1.rigid=true", "arms.arm1.density=5000.0", "arms.length=0.8")
-    body = chain_of(built.scene, {1: rigid_bar(1.0, 1.0, 1.0)})[0]
-    meshed = arm_of((24, 3), "arms.length=0.8", "material.density=5e3")
-    twin = meshed.reduce(np.ones(meshed.mesh.num_cells))
-    # Gmsh places nodes to 1e-12 of the length.
-    assert body.mass == pytest.approx(twin.mass, rel=1e-11)
-    np.testing.assert_allclose(body.w[:, 0], twin.w[:, 0], atol=1e-11 * twin.mass)
-    assert body.W[0, 0, 0] == pytest.approx(twin.W[0, 0, 0], rel=1e-11)
-    np.testing.assert_allclose(body.outboard_point, twin.outboard_point, atol=1e-12)
 
 
 @pytest.mark.serial  # ranks have no part in it
@@ -194,22 +173,6 @@ def test_load_cases_are_the_worst_instants(worst: str) -> None:
     assert evaluation.compliance == pytest.approx(most, rel=1e-12)
 
 
-def test_constraints_say_how_far_a_bound_is_exceeded() -> None:
-    """T^2 f^2 - 1 arm by arm and u / bound - 1; p-means are no more than k^(1/p) too careful."""
-    limits = "constraints.first_frequency=4.0", "constraints.tip_deflection=1e-4"
-    built = build("objective.kind=static", *limits)
-    evaluation, _ = built.evaluate(built.fields(wave))
-    periods, tips = np.array(evaluation.constraints[2:4]), np.array(evaluation.constraints[4:])
-    least = (4.0 / np.array(evaluation.values_of("eigenfrequency"))) ** 2
-    assert (1.0 + periods >= least * (1.0 - 1e-14)).all()  # equal but for rounding, if far apart
-    assert (1.0 + periods <= least * 3.0 ** (1.0 / 20.0)).all()
-    for k, arm in built.arms.items():
-        S = arm.elastic.constraint_modes.stiffness
-        largest = max(np.hypot(*np.linalg.solve(S, load)[:2]) for load in np.eye(3)[1:])
-        assert largest / 1e-4 <= (1.0 + tips[k]) * (1.0 + 1e-14)
-        assert 1.0 + tips[k] <= 2.0 ** (1.0 / 20.0) * largest / 1e-4
-
-
 @pytest.mark.serial  # ranks have no part in it
 def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None:
     """An arm set on a mode that is not the lowest: the objective follows it, the bound does not."""
@@ -248,49 +211,6 @@ def test_densities_that_are_none_are_refused(change, words) -> None:
         x[1] = change(x[1])
     with refused("arm 'arm2'", *words):
         built.evaluate(x)
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_arms_under_another_scene_keep_their_own_design() -> None:
-    """Used in turn, one with stiff arms and one with weak ones: figures and gradients."""
-    built = build("objective.kind=static", "constraints.first_frequency=4.0")
-    other = replace(built, arms={k: arm.under(built.scene) for k, arm in built.arms.items()})
-    stiff = built.fields(same)
-    weak = {k: 0.8 * x for k, x in stiff.items()}
-    expected = [built.evaluate(x)[0] for x in (weak, stiff)]
-    slopes = built.gradient()
-    for _ in range(2):
-        for one, x, want in ((other, weak, expected[0]), (built, stiff, expected[1])):
-            found = one.evaluate(x)[0]
-            assert found.objective == pytest.approx(want.objective, rel=1e-9)
-            assert found.constraints == pytest.approx(want.constraints, rel=1e-7)
-    other.evaluate(weak)
-    for k, slope in built.gradient().items():
-        np.testing.assert_allclose(slope, slopes[k], rtol=1e-7, atol=1e-9 * np.abs(slope).max())
-
-
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize(("gradient", "more"), [("esl", 7), ("exact", 17)])
-def test_solves_of_geometric_stiffness(gradient, more):
-    """Seven static solves an arm and design, ten more for the exact gradient; none without it."""
-    # Four are of the frame's acceleration, three of the modes'. The interface's unit loads are
-    # constraint modes, in the basis already; their adjoint is three of the ten. Three coordinates:
-    # searches for modes take as many solves as they need.
-    spent = {}
-    for on in ("true", "false"):
-        options = ("reduction.coordinates=3", f'objective.gradient="{gradient}"')
-        built = build(f"simulation.stiffening={on}", *options)
-        built.evaluate(built.fields(lambda k, x, y: np.full_like(x, 0.5)))  # and the decision
-        counts = built.profile.counts
-        before = replace(counts)
-        _, trajectory = built.evaluate(built.fields(wave))
-        built.gradient(trajectory)
-        spent[on] = {name: getattr(counts, name) - value for name, value in asdict(before).items()}
-    assert spent["true"]["solves"] - spent["false"]["solves"] == more * len(built.arms)
-    # What is left is the constraint modes, and their adjoint.
-    assert spent["false"]["solves"] == (3 if gradient == "esl" else 6) * len(built.arms)
-    for name in ("assemblies", "factorisations", "reductions", "eigenproblems", "simulations"):
-        assert spent["true"][name] == spent["false"][name], name
 
 
 SPACE = TWO_ARM.parent / "spatial_arm.toml"
@@ -349,44 +269,3 @@ def test_extremes_and_load_cases_look_every_millisecond_and_at_the_end() -> None
     assert evaluation.compliance == pytest.approx(expected, rel=1e-10)
     assert trajectory.settling == trajectory.distance[-1]  # the motion ends with the horizon
     assert len(trajectory.sampled.t) == 3  # evenly: 0, 0.7 and 1.4 s
-
-
-@pytest.mark.serial
-def test_fast_machines_are_looked_at_more_often() -> None:
-    """Beside twenty times as many instants; the crank does 3000 revolutions a minute."""
-    fast = ["motion.speed=314.0", "motion.duration=0.03", "motion.horizon=0.0603"]
-    _, _, trajectory = seen(TWO_ARM.parent / "slider_crank.toml", "arms.rod.cells=[24,2]", *fast)
-
-    def extremes(count: int) -> np.ndarray:
-        one = trajectory.at(np.linspace(0.0, trajectory.t[-1], count + 1))
-        return np.array([one.max_deviation[0], one.compliance.max(), one.drives[0][1]])
-
-    count = len(trajectory.t) - 1
-    right = extremes(20 * count)
-    # Measured: 1e-4, 1e-4 and 1e-5; every millisecond 8e-3, 6e-3 and 2e-2.
-    missed = 1.0 - extremes(count) / right
-    assert (missed < [3e-4, 3e-4, 1e-3]).all() and (missed >= 0.0).all()
-    assert (1.0 - extremes(61) / right > 5e-3).all()
-
-
-def test_instants_follow_the_bend_of_the_motion() -> None:
-    """A vibration of 100 Hz in closed form: no extreme is missed by more than 1e-4 of it."""
-    speed, horizon, steps = 200.0 * np.pi, 0.5, 2000
-    grid, nodes = np.linspace(0.0, horizon, steps + 1), radau_iia(4).c
-    times = grid[:-1, None] + np.diff(grid)[:, None] * nodes
-    wave_of = lambda f, t: f(speed * t)[..., None]  # noqa: E731
-    solution = Solution(
-        grid, nodes, wave_of(np.sin, grid[:-1]), speed * wave_of(np.cos, grid[:-1]),
-        -(speed**2) * wave_of(np.sin, times), 0.0, 0,
-    )  # fmt: skip
-    K = np.array([[3.0]])
-    t = response_instants(solution, K, slice(None), 0.0, horizon, 30)
-    assert (t[0], t[-1]) == (0.0, horizon)
-    assert (speed * t[1]) ** 2 / 8.0 == pytest.approx(1e-4, rel=0.2)
-    slow = response_instants(
-        replace(solution, a=1e-4 * solution.a), K, slice(None), 0.0, horizon, 30
-    )
-    np.testing.assert_array_equal(slow, np.linspace(0.0, horizon, 501))
-    assert len(response_instants(solution, K, slice(None), 0.0, horizon, 100_000)) == 100_001
-    long = replace(solution, time_grid=1e5 * grid)
-    assert len(response_instants(long, K, slice(None), 0.0, 1e5 * horizon, 30)) == 100_001

@@ -6,26 +6,19 @@ densities that are changed, and on meshes whose nodes are moved.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from loops import BOOM_TABLE, SOFT, bennett, boom, closed, four_bar
 from machines import demo_machine
-from moved_nodes import built_with, node_test, noise
-from remainders import built_of, hold_instants, limit_rates, rates, taylor, wave
-from runs import by_root, minimising
+from moved_nodes import node_test
+from remainders import built_of, hold_instants, limit_rates, taylor, wave
+from runs import by_root
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm
-from dolfinopt.arms.design_state import DesignState
 from dolfinopt.fem.forms import ELEMENTS
-from dolfinopt.fem.shape_derivative import ShapeDerivative
-from dolfinopt.responses.evaluation import gradient
-from dolfinopt.responses.products import Products, by_nodes
 from dolfinopt.responses.response import constraints_of
-from dolfinopt.responses.sensitivity import esl_gradient
 from dolfinopt.scene.tables.responses import DECLARED, objective_kinds
 
 ROUGHLY = ("simulation.tolerance=1e-3", "simulation.sample=0.01", "objective.gradient=exact")
@@ -448,80 +441,3 @@ def test_by_nodes(base, changes, shared_tmp_path, monkeypatch) -> None:
     found = node_test(scene, wave, BASES[base][2], cut=base == "tetrahedra", response=limited)
     assert found.slope != 0.0
     assert found.rate == pytest.approx(2.0, abs=0.1)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    ("kind", "part"),
-    [("effort", "places"), (WHOLE, "interfaces"), ("stress", "volumes"),
-     ("stress", "stress"), (WHOLE, "geometric_stiffness"), ("buckling", "prestress")],
-)  # fmt: skip
-def test_what_is_left_out_is_found(kind, part, shared_tmp_path, monkeypatch) -> None:
-    """Each part of the chain by nodes alone: remainders become of first order."""
-    if part == "geometric_stiffness":
-
-        def none(*_: object) -> float:
-            return 0.0
-
-        monkeypatch.setattr(ShapeDerivative, part, none)
-    else:
-
-        def without(state: DesignState, products: Products) -> np.ndarray:
-            return by_nodes(state, replace(products, **{part: None}))
-
-        monkeypatch.setattr("moved_nodes.by_nodes", without)
-    told = f"objective.kind={kind}", "payload.mass=0.1", "constraints.compliance=1e6", BENT, SKEWED
-    scene = contract("two_arm", (*TRIANGLES, *told), shared_tmp_path, monkeypatch)
-    assert node_test(scene, wave, 0.015).rate < 1.7
-
-
-@pytest.mark.serial
-def test_height_of_a_bar_bent_by_a_moment(shared_tmp_path) -> None:
-    """Compliance M^2 L / (E t h^3 / 12) and mass: exact in quadratic triangles without nu."""
-    moment, told = 3.0, (*TRIANGLES, "objective.kind=static", "material.poisson_ratio=0.0")  # N m
-    scene = scene_of("two_arm", (*told, f"objective.loads=[[0,0,{moment}]]"), shared_tmp_path)
-    built = built_with(scene, lambda arm, x: np.zeros_like(x))
-    built.evaluate(built.uniform(1.0))
-    found = []  # derivatives by the relative height of every arm: a step of h / h
-    for one in (scene, minimising(scene, "mass")):
-        by_place = gradient(one, built.partition, built.arms, None, built.profile, by=by_nodes)
-        heights = {k: arm.mesh.mesh.geometry.x[:, 1] for k, arm in built.arms.items()}
-        found.append([float(by_place[k][:, 1] @ y) for k, y in heights.items()])
-    arm, material = scene.arms[0], scene.material
-    bent = moment**2 * arm.length / (material.young_modulus * arm.thickness * arm.height**3 / 12.0)
-    assert found[0] == pytest.approx([-3.0 * bent] * 2, rel=1e-8)
-    mass = material.density * arm.length * arm.height * arm.thickness
-    assert found[1] == pytest.approx([mass] * 2, rel=1e-12)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("base", ["two_arm", "tetrahedra"])
-def test_frozen_loads_by_nodes(base, shared_tmp_path) -> None:
-    """The gradient by equivalent static loads is that of the compliance under held loads."""
-    size, cut = BASES[base][2], base == "tetrahedra"
-    scene = scene_of(base, (*TRIANGLES * (not cut), LINEAR), shared_tmp_path)
-    loads: list[np.ndarray] = []
-
-    def compliance(h: float) -> tuple[Arm, float]:
-        def places(arm: str, x: np.ndarray) -> np.ndarray:
-            return size * (0.2 * noise(arm, x, 7) + h * noise(arm, x))
-
-        arm = next(iter(built_with(scene, places, cut).arms.values()))
-        arm.state(np.ones(arm.mesh.num_cells))
-        elastic = arm.current.elastic
-        nodes = elastic.interior_nodes  # in an order that moves may change
-        if not loads:
-            interior, outboard = elastic.restrict(elastic.stiffness_times(arm.current.basis.V))
-            nodal = np.zeros(arm.current.basis.V.shape)
-            nodal[nodes] = interior.reshape(len(nodes), *nodal.shape[1:])
-            loads.extend((nodal, outboard))
-        interior = loads[0][nodes].reshape(-1, loads[0].shape[2])
-        u = elastic.static_response(interior, loads[1])
-        return arm, float(np.trace(elastic.energy_matrix(u)))
-
-    arm, _ = compliance(0.0)
-    found = esl_gradient(arm.current, np.eye(loads[0].shape[2]), by_nodes)
-    even: dict[str, np.ndarray] = {}
-    built_with(scene, lambda name, x: np.zeros_like(x), cut, even)
-    slope = size * float(np.sum(found * noise(arm.mesh.name, even[arm.mesh.name])))
-    assert rates(lambda h: compliance(h)[1], slope) == pytest.approx(2.0, abs=0.05)

@@ -8,18 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from machines import held_link
-from remainders import build, built_of
-from runs import TWO_ARM, demo, overrides, refused, run, scene, summary_of, tomllib
+from remainders import built_of
+from runs import demo, refused, scene
 
 import dolfinopt as do
 from dolfinopt import Model
 from dolfinopt.motion.build import rests
-from dolfinopt.part.folder import toml_text
 from dolfinopt.plots.curves import constraint_label, deviation_limits, limits_by_column
-from dolfinopt.responses.constraints import EXCESS, limits_of
+from dolfinopt.responses.constraints import limits_of
 from dolfinopt.responses.response import find
 from dolfinopt.scene.laws import Limits, law_for
-from dolfinopt.scene.load import scene_from_dict
 
 # Ranks: limits of effort and peak force in test_every_option_gives_the_same_bits_on_any_number...
 EFFORT = "objective.kind=effort"
@@ -116,22 +114,6 @@ def test_weighted_sum_of_peak_forces_as_objective() -> None:
 
 
 @pytest.mark.serial
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "limit", ["effort=7.4", "peak_force=[100.0,15.0,7.0]"], ids=["effort", "peak force"]
-)
-def test_a_limit_of_the_drives_is_met(limit: str) -> None:
-    """The stiffest light arms are heavier than these drives can take: true values end at it."""
-    changes = ["arms.cells=[24,3]", "payload.mass=0.5", f"constraints.{limit}"]
-    changes += ["design.volume_fraction=0.7", "design.filter_radius=0.05"]
-    changes += ["simulation.tolerance=1e-3", "motion.horizon=2.2", "optimizer.max_iterations=30"]
-    result = do.optimize(scene(*changes))
-    assert not result.violated
-    asked = [one for one in result.limits if one.quantity != "volume_fraction"]
-    assert -5e-3 < max(one.excess for one in asked) <= 1e-3
-
-
-@pytest.mark.serial
 def test_effort_demo(tmp_path: Path) -> None:
     """Runs, tables and draws on few cells."""
     rows = demo("demo_effort").main(tmp_path, (20, 2), 3)
@@ -224,16 +206,6 @@ def test_a_stop_at_the_end_of_a_table_begins_the_last_rest(tmp_path):
 
 
 @pytest.mark.serial
-def test_without_stops_settling_is_as_ever():
-    one = scene(*QUICK)
-    assert rests(one) == ((one.motion.duration, one.motion.horizon),)
-    _, trajectory = moved(one)
-    after = trajectory.t >= one.motion.duration - 1e-9 * one.motion.horizon
-    assert np.array_equal(trajectory.at_rest, after)
-    assert "settling_after" not in one.constraints.limits
-
-
-@pytest.mark.serial
 def test_a_dwell_is_longer_than_the_delay(tmp_path):
     delay = "constraints.settling_after=0.3"
     with refused("motion.dwells", "settling_after = 0.3 [s]", "[0.4, 0.6]"):
@@ -241,30 +213,6 @@ def test_a_dwell_is_longer_than_the_delay(tmp_path):
     # The stops of a table are known with it.
     with refused("settling_after = 0.3: expected less than 0.3 [s]", "from 0.3 to 0.6 s"):
         strokes(tmp_path, BOTH, delay)
-
-
-@pytest.mark.serial
-def test_the_summary_tells_the_same(tmp_path):
-    delay = "constraints.settling_after=0.1"
-    one = strokes(tmp_path, BOTH, delay)
-    told = ["motion.path=joints", f"motion.file={one.motion.file}", "motion.duration=1.6",
-            "motion.horizon=2", *QUICK, delay]  # fmt: skip
-    run("simulate", TWO_ARM, "--out", tmp_path / "run", "--no-plots", *overrides(*told))
-    summary = summary_of(tmp_path / "run")
-    _, trajectory = moved(one)
-    inside = (trajectory.t >= 0.4 - 1e-9) & (trajectory.t <= 0.6 + 1e-9)
-    assert summary["settling"] == trajectory.distance[inside].max()
-    assert summary["scene"]["motion"]["dwells"] is True
-
-
-@pytest.mark.serial
-def test_dwells_stand_in_the_scene_of_a_part():
-    """part.toml is written by the same function."""
-    told = scene("motion.dwells=[[0.4,0.5],[1.2,1.6]]", "constraints.settling_after=0.05")
-    again = scene_from_dict(tomllib.loads(toml_text(told.to_tree())))
-    assert rests(again) == rests(told) == ((0.45, 0.5), (1.25, 1.6), (1.95, 3.0))
-    none = scene_from_dict(tomllib.loads(toml_text(scene("motion.dwells=false").to_tree())))
-    assert none.motion.dwells is False
 
 
 # -- orientation: how far the end-effector is turned from where rigid links would hold it  --------
@@ -303,32 +251,7 @@ def test_cantilever_under_its_payload(kind, controlled, tmp_path):
     assert run.trajectory.max_rotation == np.linalg.norm(turned, axis=1).max()
 
 
-@pytest.mark.serial
-@pytest.mark.slow
-def test_lightest_arm_keeps_its_end_straight(tmp_path):
-    """Met by the true value where it can be; what even a solid arm does not keep is said."""
-    light = "objective.kind=mass", "arms.cells=[30,4]", "design.filter_radius=0.0"
-    told = "design.initial=0.6", "optimizer.max_iterations=150"
-    results = []
-    for limit in (2.5e-3, 1e-3):
-        scene = machine("plane", tmp_path, *light, *told, f"constraints.orientation={limit}")
-        results.append(do.optimize(scene))
-        (found,) = results[-1].limits
-        assert (found.name, found.unit) == ("orientation", "rad")
-        assert found.value == results[-1].trajectory.max_rotation
-    kept, broken = results
-    assert kept.converged and not kept.violated
-    assert kept.limits[0].value == pytest.approx(2.5e-3, rel=0.04)  # active: 3 % within
-    solid = 1e-3 * LENGTH * HEIGHT * THICKNESS  # kg
-    assert 0.3 * solid < kept.evaluation.objective < 0.5 * solid  # 0.309
-    assert "no design near this one meets orientation <= 0.001 rad" in broken.stop_reason
-
-
 # -- stiffness of single arms under given loads: Timoshenko's cantilever, a limit kept  -----------
-
-
-PLANE = "constraints.stiffness=[{arm='arm1', force=[3.0,100.0], moment=-5.0, displacement=1e-4}, "
-PLANE += "{arm='arm2', moment=2.0, displacement=1e-4, rotation=2e-3}]"
 
 
 @pytest.mark.serial
@@ -353,38 +276,3 @@ def test_timoshenkos_cantilever(dim, tmp_path) -> None:
     assert (place.name, place.unit) == ("stiffness_link_case1", "m")
     assert (turn.name, turn.unit) == ("stiffness_link_case1_rotation", "rad")
     assert not turn.met and "stiffness of link_case1_rotation" in turn.sentence
-
-
-@pytest.mark.slow
-@pytest.mark.serial
-def test_lightest_arms_keep_their_stiffness(tmp_path) -> None:
-    """Each case is active that another one does not make needless."""
-    told = ("objective.kind=mass", "arms.cells=[30,6]", "design.filter_radius=0",
-            "design.initial=0.8", "optimizer.max_iterations=60", "constraints.stiffness=["
-            "{arm='arm1', force=[0.0,100.0], displacement=8e-3}, "
-            "{arm='arm2', moment=50.0, rotation=2e-2}, "
-            "{arm='arm2', force=[1.0,0.0], displacement=1.0}]")  # fmt: skip
-    found = do.optimize(build(*told).scene)
-    assert not found.violated
-    limits = {one.name: one for one in found.limits if one.quantity == "stiffness"}
-    active = ["stiffness_arm1_case1", "stiffness_arm2_case2_rotation"]
-    for name in active:
-        assert limits[name].value == pytest.approx(limits[name].limit, rel=EXCESS)
-    assert limits["stiffness_arm2_case3"].excess < -0.9
-
-
-@pytest.mark.serial
-def test_the_plane_pays_no_solve_for_it() -> None:
-    """Constraint modes are there in any case; a scene without the key is as before."""
-    counts = []
-    for told in ((), (PLANE,)):
-        built = build("objective.kind=compliance", *told)
-        evaluation, trajectory = built.evaluate(built.uniform(0.5))
-        counts.append(built.profile.counts.solves)
-        if told:
-            names = ("arm1_case1", "arm2_case2", "arm2_case2_rotation")
-            found = evaluation.responses[-1]
-            assert found.arms == names and found.values == found.smooth
-        built.constraint_gradients(trajectory)
-        assert built.profile.counts.solves == counts[-1]
-    assert counts[0] == counts[1]

@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from remainders import taylor, wave
 from runs import TWO_ARM, demo, refused, scene
-from scipy.optimize import brentq
 
-import dolfinopt as do
-from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.multibody.shape_integrals import scaled
 from dolfinopt.optimization.gradient_check import TaylorTest
 from dolfinopt.reduction import METHODS, AdjointFields, Method
-
-WORLD = MPI.COMM_WORLD
-
 
 QUICK = ("arms.cells=[24,3]", "motion.horizon=2.2", "simulation.tolerance=1e-3")
 # At random designs of undamped arms the remainder's cubic part outweighs its square at 0.01.
@@ -90,37 +82,6 @@ def test_a_wrong_gradient_is_found(monkeypatch: pytest.MonkeyPatch, fault) -> No
     test = taylor(scene(*QUICK, "design.filter_radius=0.05", *LOADED), wave, finest)
     assert not test.passed
     assert min(row.rate for row in test.rows) < 1.3
-
-
-@cache
-def fixed_frequencies(height: float) -> tuple[float, float]:
-    """Return lambda of the first axial and the second bending mode, interfaces fixed, rad2/s2."""
-    # The axial one is the only mode with a mean displacement along the arm.
-    loaded = scene(*QUICK, "reduction.coordinates=6", f"arms.height={height!r}")
-    arm = Arm(loaded, 0, MPI.COMM_SELF, do.Profile())
-    body = arm.reduce(arm.uniform(0.5))
-    values = np.diag(body.K)[3:]
-    axial = int(np.argmax(np.abs(body.w[0, 4:])))
-    return float(values[axial]), float(np.delete(values, axial)[1])
-
-
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize("apart", [0.0, 1e-6], ids=["equal", "close"])
-def test_repeated_frequencies(apart: float) -> None:
-    """Bending and axial modes of one frequency mix anyhow, and the gradient does not care."""
-
-    def gap(height: float) -> float:
-        axial, bending = fixed_frequencies(height)
-        return bending / axial - 1.0 - apart
-
-    height = float(brentq(gap, 0.47, 0.51, xtol=1e-15, rtol=1e-14))
-    assert gap(height) == pytest.approx(0.0, abs=1e-10)  # eigenvalues are right to about 1e-12
-    changes = ["reduction.coordinates=6", "design.filter_radius=0", "payload.mass=1.0"]
-    # Softer: as many time steps as a slender arm takes; the ratio of frequencies is the same.
-    changes += [f"arms.height={height!r}", "material.young_modulus=7e8"]
-    test = taylor(scene(*QUICK, *changes), lambda k, x, y: np.full_like(x, 0.5), FINER)
-    assert test.passed, rates(test)
-    assert np.isfinite([row.slope for row in test.rows]).all()
 
 
 @pytest.mark.slow

@@ -5,13 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import basix
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from mpi4py import MPI
-from remainders import Built, build, built_of, uneven, wave
-from runs import ROOT, TWO_ARM
+from remainders import Built, build, built_of, wave
+from runs import TWO_ARM
 
 import dolfinopt as do
 from dolfinopt.arms.arm import Arm
@@ -24,7 +22,6 @@ from dolfinopt.responses.stress import (
     CellStress,
     arm_loads,
     cell_stress,
-    every_instant,
     maxima,
     motions_of,
     screen,
@@ -74,30 +71,6 @@ def all_loads(arm, body, rates_at, outboard, n):
     return interior, end + outboard[:, None]
 
 
-def geometric_matrix(arm, c):
-    """Return sum_p p K0_p of all nodal displacements, assembled from the loads' stress."""
-    # Of the loads -p = c of frame, outboard interface and modes at one instant; 3 x 3 Gauss points.
-    elastic, loads = arm.current.elastic, arm.current.stiffening_loads
-    frame, outboard, modes = np.split(-c[: 7 + arm.coordinates], [4, 7])
-    p = np.concatenate([frame, modes, outboard])
-    operators, corners = elastic.operators, elastic.operators.corners
-    points, weights = basix.make_quadrature(basix.CellType.quadrilateral, 4)
-    count = len(operators.cells)
-    values = (loads.fields @ p)[operators.cells].reshape(count, 1, -1, 1)
-    stress = elastic.young[:, None, None] * (operators.stress(points) @ values)[..., 0]
-    Q1 = basix.create_element(basix.ElementFamily.P, basix.CellType.quadrilateral, 1)
-    local = np.moveaxis(Q1.tabulate(1, points)[1:, :, :, 0], 0, 2)
-    J = np.einsum("eni,pnk->epik", corners, local)
-    xx, yy, xy = np.moveaxis(stress, 2, 0) * weights * abs(np.linalg.det(J)) * operators.thickness
-    D = (local @ np.linalg.inv(J)).swapaxes(2, 3)
-    tensor = np.stack([np.stack([xx, xy], -1), np.stack([xy, yy], -1)], -1)
-    blocks = np.einsum("epai,epab,epbj->eij", D, tensor, D)
-    rows, columns = (np.broadcast_to(x, blocks.shape).ravel() for x in (
-        elastic.operators.cells[:, :, None], elastic.operators.cells[:, None, :]))  # fmt: skip
-    scalar = sp.csr_matrix((blocks.ravel(), (rows, columns)), shape=(len(elastic.points),) * 2)
-    return sp.kron(scalar, sp.eye(2))
-
-
 def lengths(cells: CellStress, field: np.ndarray) -> np.ndarray:
     """Return the relaxed stress of a nodal field (n_nodes, 2)."""
     elastic = cells.fields.arm
@@ -120,13 +93,6 @@ def test_both_ways_to_the_loads_agree() -> None:
     """From the passes of inverse dynamics, and from the rows of coordinates that never move."""
     built = build("simulation.stiffening=true", "motion.gravity=[0,-9.81]", "arms.joint_mass=0.3")
     agree_with_rows(Analysed(built, built.fields(wave)).trajectory, 1e-12)
-
-
-@pytest.mark.serial
-def test_loads_of_a_closed_loop_are_those_of_its_rows() -> None:
-    settings = ["arms.cells=[8,2,2]", "simulation.tolerance=1e-2", "simulation.sample=0.01"]
-    model = do.Model(do.load_scene(ROOT / "demos/five_bar.toml", settings))
-    agree_with_rows(model.simulate().trajectory, 1e-10)
 
 
 def analysed_arms(built: Built):
@@ -169,28 +135,6 @@ def test_static_solution_of_all_loads(method: str, element: str) -> None:
             modal = lengths(cells, arm.current.basis.V @ q[n])
             worst = max(worst, float(np.abs(modal - full).max() / full.max()))
     assert worst > (0.05 if method == "modal" else 1e-4)
-
-
-@pytest.mark.serial
-def test_static_solution_of_the_stiffened_arm() -> None:
-    """With stiffening, K less the geometric stiffness of the loads: 0.28 % of 1 % and more."""
-    # The assembled matrix knows nothing of the rotation of second order of the interface; without
-    # it the reduced body agrees to 0.2 %.
-    built = build("simulation.stiffening=true", "simulation.tolerance=1e-5",
-                  "motion.horizon=1.9", "damping.stiffness_proportional=0")  # fmt: skip
-    effect = 0.0
-    for arm, cells, c, _, found, right in analysed_arms(built):
-        elastic, n = arm.current.elastic, int(np.argmax(np.abs(c[:, 5])))
-        interior, end = right(n)
-        linear = elastic.static_response(interior, end)[:, :, 0]
-        Kg, u = geometric_matrix(arm, c[n]), linear
-        for _ in range(6):  # K u = f + sum_p p K0_p u
-            more = elastic.restrict((Kg @ u.ravel()).reshape(-1, 2, 1))
-            u = elastic.static_response(interior + more[0], end + more[1])[:, :, 0]
-        full = lengths(cells, u)
-        assert np.abs(found(n) - full).max() < 3.5e-3 * full.max()
-        effect = max(effect, float(np.abs(lengths(cells, linear) - full).max() / full.max()))
-    assert effect > 0.01  # it is there
 
 
 @pytest.mark.serial
@@ -245,50 +189,6 @@ def test_void_has_no_stress() -> None:
 
 
 @pytest.mark.serial
-def test_gradient_with_frozen_loads() -> None:
-    """That of the static solutions under the loads of the instants, by differences."""
-    built = build("simulation.sample=0.05", "simulation.stiffening=false",
-                  "damping.stiffness_proportional=0", "objective.gradient=esl")  # fmt: skip
-    x, d = built.fields(wave), built.fields(uneven)
-    one = Analysed(built, x)
-    gradient, p = one.gradient(), built.scene.objective.stress_exponent
-    found = one.response._found(one.analysis)
-    loads = {}
-    for k, each in found.items():
-        sums = each.sums
-        state, part = built.arms[k].current, one.trajectory.mechanism.slices[k]
-        fields = state.load_fields.columns
-        # K u of every instant.
-        loads[k] = [
-            state.elastic.restrict(state.elastic.stiffness_times((fields @ a)[:, :, None]))
-            for a in every_instant(each.loads)
-        ]
-        assert part is not None
-
-    def value(h: float) -> float:
-        total = 0.0
-        for k, right in loads.items():
-            arm = built.arms[k]
-            arm.state(x[k] + h * d[k])
-            cells = cell_stress_of_fields(arm)
-            for interior, end in right:
-                u = arm.current.elastic.static_response(interior, end)[:, :, 0]
-                total += float(cells.weights @ (lengths(cells, u) / sums.largest) ** p)
-        return sums.largest * (total / sums.weight) ** (1.0 / p)
-
-    assert value(0.0) == pytest.approx(sums.smooth, rel=1e-6)
-    slope = built.dot(gradient, d)
-    assert slope == pytest.approx((value(1e-5) - value(-1e-5)) / 2e-5, rel=1e-5)
-
-
-def cell_stress_of_fields(arm) -> CellStress:
-    """Return weights and relaxation of a design alone."""
-    state = arm.current
-    empty = np.zeros((3, len(state.x_phys), 0))
-    return CellStress(state.load_fields, empty, arm.mesh.area, np.sqrt(state.x_phys))
-
-
-@pytest.mark.serial
 def test_stress_in_python() -> None:
     """Asked for, a simulation knows it and draws it; an optimisation knows it anyway."""
     model = do.Model(do.load_scene(TWO_ARM, ["arms.cells=[20,3]", "simulation.sample=0.01"]))
@@ -296,25 +196,6 @@ def test_stress_in_python() -> None:
     assert np.isnan(plain.max_stress) and plain.plot_stress() is None
     assert 1e6 < asked.max_stress < 1e9
     assert asked.plot_stress() is not None
-
-
-@pytest.mark.serial
-@pytest.mark.slow
-def test_lightest_arms_below_a_stress() -> None:
-    """The true stress meets the limit that the lightest arms run into; history and summary say."""
-    options = [
-        "arms.cells=[24,4]", "design.filter_radius=0.03", "simulation.sample=0.01",
-        "reduction.coordinates=3", "optimizer.max_iterations=40", "design.volume_fraction=1.0",
-        "objective.gradient=exact", "objective.kind=mass", "design.initial=0.6",
-        "motion.duration=2.4", "motion.horizon=2.6", "constraints.stress=35e6",
-    ]  # fmt: skip
-    rows = []
-    result = do.optimize(do.load_scene(TWO_ARM, options), report=rows.append)
-    one = next(each for each in result.limits if each.quantity == "stress")
-    assert one.unit == "Pa" and one.met and one.value > 0.95 * one.limit, one.sentence
-    assert rows[-1].constraints["stress"] == one.value
-    assert max(row.constraints["stress"] for row in rows) > 1.1 * one.limit  # it was in the way
-    assert result.evaluation.objective < 0.5 * rows[0].objective
 
 
 # -- stress of a turning arm against beam theory, and of a hole in it against Heywood's factor  ---
