@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import tomllib
-from bodies import derivative
 from loops import (
     BASE,
     BOOM_TABLE,
@@ -131,23 +130,6 @@ def test_closed_forms(tmp_path, tree: dict, table: str, law: Law) -> None:
         assert np.abs(by - expected).max() < 1e-8 * (1.0 + np.abs(expected).max())
 
 
-def at_start(scene: Scene) -> np.ndarray:
-    q: np.ndarray = rigid_motion(np.zeros(1), scene).q[0]
-    return q
-
-
-def test_the_guess_chooses_the_branch(tmp_path) -> None:
-    """The five-bar's tool on the other side of the line between its knees."""
-    table = "t,a,b\n0,2.0,1.1\n1,1.6,0.8\n"
-    above = at_start(closed(tmp_path, table, five_bar()))
-    guess = {"initial_joints": [2.0, -3.0, 1.1, 3.0]}
-    below = at_start(closed(tmp_path, table, five_bar(), motion=guess))
-    left, right = 0.2 * np.exp(1j * above[0]), 0.3 + 0.2 * np.exp(1j * above[2])
-    tools = [left + 0.3 * np.exp(1j * (q[0] + q[1])) for q in (above, below)]
-    mirrored = left + (right - left) * np.conj((tools[0] - left) / (right - left))
-    assert abs(tools[1] - mirrored) < EXACT
-
-
 def test_a_path_of_the_plate_moves_the_drives(tmp_path) -> None:
     """All joints of the delta are unknown: six follow, three drive the plate along points."""
     file = tmp_path / "points.csv"
@@ -232,20 +214,6 @@ def test_run_up_of_a_crank() -> None:
     later = 0.4 + SPEED * (0.5 * DURATION + t - DURATION)
     np.testing.assert_allclose(angle, np.where(u < 1.0, first, later), rtol=0, atol=1e-13)
     assert rate[-1] == SPEED and growth[-1] == 0.0
-
-
-@pytest.mark.parametrize("law", ["quintic", "septic", "trapezoidal", "s-curve"])
-def test_speed_follows_the_law(law: str) -> None:
-    """The angle's derivative is the speed, and the speed's the acceleration, for every law."""
-    for instant in (0.31 * DURATION, 0.52 * DURATION, 1.5 * DURATION):
-        at = np.array([instant])
-        # Differences over a hundredth of the run-up; laws are smooth there.
-        for order in (0, 1):
-            change = derivative(
-                lambda h, k=order, at=at: crank(at + 1e-2 * DURATION * h, law)[k][0, 0]
-            )
-            expected = crank(at, law)[order + 1][0, 0]
-            assert change / (1e-2 * DURATION) == pytest.approx(expected, rel=1e-9, abs=1e-7)
 
 
 # -- loops of the plane ----------------------------------------------------------------------

@@ -14,15 +14,12 @@ import numpy as np
 import pytest
 from bodies import assert_close, derivative
 from runs import refused
-from scipy.optimize import brentq
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, forced_rest, rigid_motion
 from dolfinopt.motion.measured import TABLE_CORNERS_LIMIT
-from dolfinopt.motion.plane import Bend
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.scene.laws import Limits, law_for
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -121,18 +118,6 @@ def test_two_arms_trace_the_arc(keys: dict[str, Any]) -> None:
     assert_close(motion.q[rest], np.broadcast_to(motion.q[-1], motion.q[rest].shape), 1e-15)
 
 
-@pytest.mark.parametrize("law", ["quintic", "septic"])
-def test_line_is_straight(law: str) -> None:
-    """From start to end, by the law, all derivatives along it."""
-    of = scene(path="line", start=[-0.4, 0.1], end=[0.8, 0.6], law=law)
-    path = desired_path(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), of)
-    assert_close(path[0], [[-0.4, 0.1], [0.2, 0.35], [0.8, 0.6], [0.8, 0.6]], 1e-15)
-    p, pd, pdd = desired_path(INSIDE, of)
-    s = law_for(law, 1.0, Limits(), 0.25)(INSIDE, DURATION)
-    for found, expected in zip((p - [-0.4, 0.1], pd, pdd), s, strict=True):
-        assert_close(found, np.outer(expected, [1.2, 0.5]), 1e-15)
-
-
 LENGTHS = {1: (1.0,), 2: (1.1, 0.9), 3: (0.8, 0.7, 0.5), 4: (0.6, 0.5, 0.5, 0.4)}  # m
 POINTS = np.array([[-0.7, 0.0], [-0.5, 0.3], [0.0, 0.2], [0.4, 0.35], [0.6, 0.1]])  # m
 TIMES = np.array([0.0, 0.5, 0.9, 1.3, DURATION])  # s
@@ -211,43 +196,6 @@ def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str)
     assert np.abs(ends.qd).max() < 1e-10 * size
     assert_close(ends.q[:2], ends.q[[0, 0]], 1e-12)
     assert_close(ends.q[3:], ends.q[[2, 2]], 1e-12)
-
-
-@pytest.mark.parametrize("arms", [2, 3, 4, 7])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_bend_is_the_first_from_stretched(arms: int, seed: int) -> None:
-    """By brackets on the chain's own distance: monotone to the least one, and its inverse."""
-    lengths = tuple(np.random.default_rng(seed).uniform(0.2, 1.0, size=arms))
-    bend = Bend(lengths)
-
-    def distance(beta: float) -> float:
-        return float(abs(sum(a * np.exp(1j * k * beta) for k, a in enumerate(lengths))))
-
-    last = np.arccos(bend.least)
-    grid = np.linspace(0.0, last, 400)
-    chain = np.array([distance(beta) for beta in grid])
-    assert (np.diff(chain) < 1e-12).all()
-    if last < np.pi:
-        # Behind the first minimum it rises; 1e-3 rad from it by some 1e-6 of a length.
-        assert distance(last + 1e-3) > distance(last)
-    assert_close(bend.reach, [distance(last), sum(lengths)], 1e-12)
-    wanted = np.linspace(bend.reach[0], bend.reach[1], 23)[1:-1]
-    found = bend.angle(wanted)
-    exact = [brentq(lambda b, d=d: distance(b) - d, 0.0, last, xtol=1e-15) for d in wanted]
-    assert_close(found, exact, 1e-13)  # the distance to rounding over its slope, 0.01 or so
-
-
-@pytest.mark.parametrize("arms", [2, 3])
-def test_angles_do_not_depend_on_the_instants_asked_for(arms: int) -> None:
-    """Alone, backwards and far apart: the shoulder's angle passes pi and goes on."""
-    keys = {"joint_height": 0.3, "cart_follow": 0.0}
-    of = scene({2: (1.0, 1.0), 3: (0.8, 0.8, 0.8)}[arms], **keys)
-    whole = rigid_motion(DENSE, of).q
-    assert np.ptp(np.floor((whole[:, 1] + np.pi) / (2.0 * np.pi))) == 1.0  # it passes
-    assert np.array_equal(rigid_motion(DENSE[::-1], of).q[::-1], whole)
-    alone = [rigid_motion(DENSE[k : k + 1], of).q[0] for k in range(0, len(DENSE), 40)]
-    assert np.array_equal(alone, whole[::40])
-    assert rigid_motion(np.empty(0), of).q.shape == (0, 1 + arms)
 
 
 LINE = {

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bodies import assert_close, derivative
+from bodies import assert_close
 from runs import TWO_ARM, refusal
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
-from dolfinopt.motion.paths import Curve, curve_by_chord, curve_in_time
+from dolfinopt.motion.paths import curve_by_chord, curve_in_time
 from dolfinopt.scene.csv_table import Table, read_table
 from dolfinopt.scene.laws import Law, Limits, ShapedLaw, law_for
 from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
@@ -23,7 +23,6 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 
 LAWS = ["quintic", "septic", "trapezoidal", "s-curve"]
 EVERY = pytest.mark.parametrize("name", LAWS)
-SMOOTH = {"quintic": 2, "septic": 3, "trapezoidal": 1, "s-curve": 2}  # continuous derivatives
 
 
 def law_of(name: str, share: float = 0.25, length: float = 1.0, **limits: float) -> Law:
@@ -67,35 +66,6 @@ def test_speed_is_the_rate_and_its_area_the_distance(name: str, share: float) ->
             assert_close(after - before, [gained], 1e-13, 10.0)
             before = after
         assert_close(before, [2.0 - order], 1e-13, 1.0)
-
-
-@EVERY
-def test_law_rests_at_both_ends(name: str) -> None:
-    """Exactly: place and speed at the ends, all before and behind."""
-    law, duration = law_of(name), 0.7
-    s, sd, sdd = law(np.array([-1.0, 0.0, duration, duration * (1 + 1e-9), 2.0]), duration)
-    assert s.tolist() == [0.0, 0.0, 1.0, 1.0, 1.0]
-    assert not sd.any()
-    assert not sdd[[0, 1, 3, 4]].any()
-    if name != "trapezoidal":
-        assert not sdd.any()
-
-
-@EVERY
-@pytest.mark.parametrize("share", [0.1, 0.25, 0.5])
-def test_continuity_is_what_the_law_promises(name: str, share: float) -> None:
-    """Up to that derivative both sides of a knot agree; the next one jumps at some knot."""
-    law, duration = law_of(name, share), 1.0
-    tiny = 1e-7
-    knots = np.concatenate([[0.0], law.knots, [1.0]])
-    both = [law(knots + side * tiny, duration) for side in (-1.0, 1.0)]
-    jumps = [np.abs(a - b).max() for a, b in zip(*both, strict=True)]
-    for order in range(min(SMOOTH[name], 2) + 1):
-        assert jumps[order] <= 1e-3
-    if SMOOTH[name] == 1:
-        assert jumps[2] > 1.0
-        left = law(knots[1:], duration)[2]  # at a knot itself: the value before it
-        assert_close(left, both[0][2][1:], 1e-12)
 
 
 def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives() -> None:
@@ -242,27 +212,6 @@ def test_equal_rows_are_a_stop(tmp_path: Path, name: str) -> None:
     check_motion(of)
 
 
-def test_joints_stop_and_moves_between_stops_may_have_rows(tmp_path: Path) -> None:
-    """A spline of degree 5 between stops; a stop at the start and at the end, too."""
-    file = tmp_path / "joints.csv"
-    rows = ["0,0,1.5,-1", "0.1,0,1.5,-1", "0.4,0.1,1.2,-1.2", "0.6,0.2,1,-1.1", "0.8,0.2,1,-1.1"]
-    file.write_text("\n".join(["t,cart,arm1,arm2", *rows]))
-    of = posed(path="joints", file=str(file))
-    assert of.motion.duration == 0.8
-    t = np.concatenate([np.linspace(0.0, 0.1, 30), np.linspace(0.6, 0.9, 30)])
-    rest = rigid_motion(t, of)
-    assert not rest.qd.any()
-    assert not rest.qdd.any()
-    assert_close(rest.q[:30], np.tile([0.0, 1.5, -1.0], (30, 1)), 0.0)
-    assert_close(rest.q[30:], np.tile([0.2, 1.0, -1.1], (30, 1)), 0.0)
-    h = 1e-4
-    at = np.array([0.1, 0.25, 0.4, 0.5, 0.6])
-    before, here, after = (rigid_motion(at + k * h, of) for k in (-1, 0, 1))
-    assert_close((after.q - before.q) / (2 * h), here.qd, 1e-5, 1.0)
-    assert_close((after.qd - before.qd) / (2 * h), here.qdd, 2e-3, 10.0)
-    assert_close(rigid_motion(np.array([0.4]), of).q, [[0.1, 1.2, -1.2]], 1e-14)
-
-
 def test_limits_in_a_table_with_stops(tmp_path: Path) -> None:
     """Each move has the time that the table gives it: too little is named by file and line."""
     file = tmp_path / "pick.csv"
@@ -363,63 +312,9 @@ def test_repeated_rows_have_no_chord(same: int) -> None:
     assert_close(curve_in_time(table(TIMES, rows))(TIMES)[0][same], rows[same], 1e-13, 1.0)
 
 
-def jump(curve: Curve, order: int, at: float) -> float:
-    """Return the largest jump of a derivative at a parameter inside."""
-    step = 1e-9
-    sides = [curve(np.array([at + d]))[order] for d in (-step, step)]
-    return float(np.abs(sides[1] - sides[0]).max())
-
-
-def test_curve_in_time_goes_from_rest_to_rest() -> None:
-    """Through every row, twice (in fact four times) continuously differentiable."""
-    curve = curve_in_time(table(TIMES))
-    assert curve.end == TIMES[-1]
-    assert not curve.kinks.size
-    value, _, _ = curve(TIMES)
-    assert_close(value, ROWS, 1e-13)
-    spline = curve.moves[0][2]
-    _, first, second = spline(TIMES[[0, -1]])
-    size = [np.abs(x).max() for x in spline(np.linspace(0.0, 1.9, 99))]
-    assert_close(first, np.zeros((2, 2)), 1e-13, size[1])
-    assert_close(second, np.zeros((2, 2)), 1e-12, size[2])
-    for knot in TIMES[1:-1]:
-        # A step of 1e-9 s changes a smooth derivative by 1e-9 of the next one, some 100 times it.
-        assert jump(curve, 2, knot) < 1e-6 * size[2]
-    before = curve(np.array([-1.0, 0.0, 1.9, 5.0]))
-    assert_close(before[0], ROWS[[0, 0, -1, -1]], 1e-13)
-    assert not before[1].any()
-    assert not before[2].any()
-
-
 def test_two_rows_in_time_are_the_quintic_law() -> None:
     """Degree 5 with rest at both ends is 10 u^3 - 15 u^4 + 6 u^5."""
     curve = curve_in_time(table(np.array([0.0, 2.0]), np.array([[1.0], [4.0]])))
     u = np.linspace(0.0, 1.0, 11)
     expected = 1.0 + 3.0 * (10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5)
     assert_close(curve(2.0 * u)[0][:, 0], expected, 1e-13)
-
-
-def test_curve_by_chord_is_the_natural_cubic_spline() -> None:
-    """Through every row at its share of the chords' length; the third derivative jumps."""
-    curve = curve_by_chord(table())
-    lengths = [0.0, 0.5, np.hypot(0.8, 0.1), np.hypot(0.1, 0.5), np.hypot(0.6, 0.1)]
-    places = np.cumsum(lengths) / np.sum(lengths)
-    assert_close(curve(places)[0], ROWS, 1e-14)
-    assert_close(curve.kinks, places[1:-1], 1e-15)
-    assert_close(curve(np.array([0.0, 1.0]))[2], np.zeros((2, 2)), 1e-12, 10.0)
-    for a, b in pairwise(places):  # linear between the rows
-        ends = curve(np.array([a, 0.5 * (a + b), b - 1e-15]))[2]
-        assert_close(0.5 * (ends[0] + ends[2]), ends[1], 1e-11, 10.0)
-    for knot in places[1:-1]:
-        assert jump(curve, 2, knot) < 1e-5
-
-
-@pytest.mark.parametrize("t", [TIMES, None], ids=["time", "chord"])
-def test_derivatives(t: np.ndarray | None) -> None:
-    """By differences, away from the rows."""
-    curve = curve_by_chord(table()) if t is None else curve_in_time(table(t))
-    u = curve.end * np.array([0.07, 0.31, 0.55, 0.91])
-    value, first, second = curve(u)
-    assert value.shape == (4, 2)
-    assert_close(derivative(lambda h: curve(u + h)[0], 2e-3), first, 1e-10)
-    assert_close(derivative(lambda h: curve(u + h)[1], 2e-3), second, 1e-10)
