@@ -7,28 +7,20 @@ from functools import cache
 import numpy as np
 import pytest
 import solids
-import ufl
 from mpi4py import MPI
 from remainders import bulge
 from runs import ROOT, refusal
 from scipy.sparse.linalg import spsolve
-from solids import POISSON, elastic_link, link_mesh
+from solids import elastic_link, link_mesh
 
 from dolfinopt.fem import forms
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.fem.kernels import compile_kernels
-from dolfinopt.fem.laws import isotropic
 from dolfinopt.fem.stress import places_of
 from dolfinopt.fem.tensors import (
-    ElementTensors,
-    condensed,
     element_of,
-    geometry,
-    reference_corners,
     stress_points,
 )
-from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh, box_arm
 from dolfinopt.reduction import Options, craig_bampton
 from dolfinopt.scene.load import Arm
@@ -38,33 +30,6 @@ LENGTH, HEIGHT, THICKNESS = 1.0, 0.2, 0.01  # m
 YOUNG, DENSITY = 70e9, 2700.0  # Pa, kg/m3
 # Sums of some hundred rounded terms; Gmsh places points to 2e-12 of the length.
 ROUNDING = 1e-10
-
-
-def assumed_stress(operators: ElementTensors) -> np.ndarray:
-    """Return k_e of another element: bilinear displacements, five stresses a cell.
-
-    H = int P' S P of the compliance S, G = int P' B, k = G' H^-1 G.
-    Source: Pian & Sumihara (1984), doi:10.1002/nme.1620200911.
-    """
-    cell = operators.cell
-    space = ufl.FunctionSpace(cell.mesh, compat.lagrange_element(cell.shape, 0, 5))
-    a, b = ufl.TrialFunction(space), ufl.TestFunction(space)
-    xi, (J0, _) = (2.0 * cell.xi[k] - 1.0 for k in range(2)), forms.centre(cell)
-    ways = [(J0[0, k] ** 2, J0[1, k] ** 2, J0[0, k] * J0[1, k]) for k in range(2)]
-    x, y = xi
-
-    def stress(c):
-        bent = [(c[3] * y * first, c[4] * x * second) for first, second in zip(*ways, strict=True)]
-        return ufl.as_vector([c[k] + sum(bent[k]) for k in range(3)])
-
-    dx, u = cell.dx(2, 2), ufl.TrialFunction(cell.nodal)
-    H = ufl.inner(ufl.dot(cell.C, stress(a)), stress(b)) * dx
-    G = ufl.inner(stress(b), cell.strain(u)) * dx
-    H, G = compile_kernels([H, G])
-    at = np.pad(operators.corners, ((0, 0), (0, 0), (0, 1)))
-    g = G(at, geometry(cell, at, operators.law))
-    h = H(at, geometry(cell, at, np.linalg.inv(operators.law)))
-    return operators.thickness * g.swapaxes(1, 2) @ np.linalg.solve(h, g)
 
 
 def meshed(cells, triangles=False, comm=COMM):
@@ -162,21 +127,6 @@ def test_pure_bending_of_the_reduced_arm(element, exact):
     y = places_of(arm.operators, points)[..., 1]
     assert np.abs(found[..., 0] + y / bending).max() < 1e-9 * HEIGHT / bending
     assert np.abs(found[..., 1:]).max() < 1e-9 * HEIGHT / bending
-
-
-@pytest.mark.serial  # ranks: test_ranks
-def test_incompatible_modes_are_assumed_stresses_on_parallelograms():
-    """Two elements of other variational principles are the same there, and stay close elsewhere."""
-    nu = 0.33
-    for kind, least, most in (("parallelogram", 0.0, 1e-11), ("distorted", 1e-5, 0.2)):
-        mesh = meshed((8, 3))
-        x = mesh.mesh.geometry.x
-        skew = 0.4 * x[:, 1::-1] * [1.0, 0.2], bulge(x[:, :2], LENGTH, HEIGHT)
-        x[:, :2] += skew[kind == "distorted"]
-        one = solids.tensors_of(mesh, "incompatible", THICKNESS, nu).stiffness
-        other = assumed_stress(solids.tensors_of(mesh, "linear", THICKNESS, nu))
-        apart, size = np.abs(one - other).max(), np.abs(other).max()
-        assert least * size <= apart <= most * size
 
 
 @pytest.mark.serial  # ranks: test_ranks
@@ -346,18 +296,3 @@ def test_torsion_of_sections(element, height, cells, error):
     exact = height / 3.0 * (1.0 - 192.0 / (np.pi**5 * height) * series)
     found = torsion_constant(element, (height, 1.0), cells)
     assert 100.0 * (found / exact - 1.0) == pytest.approx(error, abs=0.06)
-
-
-@pytest.mark.parametrize("shape", ["quadrilateral", "hexahedron"])
-def test_ways_of_a_cell_without_energy(shape):
-    """Distorted cells have those of a rigid body alone."""
-    cell = forms.Cell(shape, "incompatible")
-    rng, d = np.random.default_rng(2), cell.dim
-    corners = reference_corners(cell) + rng.uniform(-0.15, 0.15, (40, 2**d, d))
-    corners *= [8e-3, 7e-3, 5e-3][:d]
-    at = np.pad(corners, ((0, 0), (0, 0), (0, 3 - d)))
-    [kernel] = compile_kernels(forms.stiffness(cell))
-    k, _, _ = condensed(kernel(at, geometry(cell, at, isotropic(d, POISSON))), d * 2**d)
-    values, rigid = np.linalg.eigvalsh(k), 3 * (d - 1)
-    assert np.abs(values[:, :rigid]).max() < 1e-14 * values[:, -1].min()
-    assert values[:, rigid].min() > 2e-3 * values[:, -1].max()

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from solids import tensors_of
 
 from dolfinopt.fem import assembly
-from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs
+from dolfinopt.fem.assembly import Cells
 from dolfinopt.fem.elasticity import ElasticArm, Substructure
 from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
@@ -114,21 +114,3 @@ def test_nodes_of_a_grid_lie_on_its_lines() -> None:
     for values, first, step in ((points[:, 0], 0.0, 0.0025), (points[:, 1], -0.03, 0.02)):
         lines = first + step * np.rint((values - first) / step)
         assert np.array_equal(values, lines)
-
-
-@pytest.mark.serial
-def test_matrices_of_blocks():
-    """By pairs of nodes, of one matrix or each cell's own: what the entries one by one give."""
-    cells = np.array([[0, 1, 2, 4], [4, 2, 3, 5], [1, 2, 3, 0]])
-    rng = np.random.default_rng(1)
-    for b in (1, 3):
-        elements = rng.standard_normal((3, 4 * b, 4 * b))
-        elements += elements.swapaxes(1, 2)
-        dofs = (b * cells[:, :, None] + np.arange(b)).reshape(3, 4 * b)
-        scale = np.array([2.0, 0.0, -1.0])
-        for given in (elements, elements[:1]):
-            found = CellMatrix(NodePairs(cells, 6), given).assemble(scale)
-            right = np.zeros((6 * b, 6 * b))
-            for own, s, A in zip(dofs, scale, np.broadcast_to(given, elements.shape), strict=True):
-                right[np.ix_(own, own)] += s * A
-            assert np.allclose(found.toarray(), right, rtol=1e-14, atol=1e-14)
