@@ -7,8 +7,7 @@ import pytest
 from mpi4py import MPI
 from remainders import built_of, rates
 from runs import ROOT
-from scipy.sparse.linalg import splu
-from solids import DENSITY, POISSON, YOUNG, rigid_tip, solid_arm
+from solids import DENSITY, POISSON, YOUNG, solid_arm
 from statics import deflection, deflection_gradient
 
 import dolfinopt as do
@@ -80,50 +79,6 @@ def test_stiffness_of_thin_walls(section, size, cells):
     """Bending, shear, extension and torsion with walls of a fortieth, within 1 %."""
     theory = {"box": box, "tube": tube}[section](size)
     assert flexibility(section, size, cells) == pytest.approx(theory, rel=0.01)
-
-
-def box_of_solids(size: tuple[float, float, float], along: int) -> np.ndarray:
-    """Return the same of a box in quadratic hexahedra of scikit-fem, one through the wall."""
-    sk = pytest.importorskip("skfem")
-    from skfem.helpers import ddot, sym_grad, trace
-
-    L, h, b = size
-    t = min(h, b) / 40.0
-    lines = [np.linspace(0.0, L, along + 1)]
-    for side in (h, b):
-        inner = np.linspace(t - 0.5 * side, 0.5 * side - t, round(along * side / L) + 1)
-        lines.append(np.concatenate([[-0.5 * side], inner, [0.5 * side]]))
-    mesh = sk.MeshHex.init_tensor(*lines)
-    _, y, z = np.abs(mesh.p[:, mesh.t].mean(axis=1))
-    mesh = mesh.remove_elements(np.flatnonzero((y < 0.5 * h - t) & (z < 0.5 * b - t)))
-    basis = sk.Basis(mesh, sk.ElementVector(sk.ElementHex2()), intorder=4)
-    lame = YOUNG * POISSON / (1.0 + POISSON) / (1.0 - 2.0 * POISSON)
-
-    @sk.BilinearForm
-    def stiffness(u, v, _):
-        e, f = sym_grad(u), sym_grad(v)
-        return lame * trace(e) * trace(f) + 2.0 * G * ddot(e, f)
-
-    T = rigid_tip(basis, L)
-    right = np.vstack([np.zeros((T.shape[1] - 6, 4)), LOADS.T])
-    found = splu((T.T @ stiffness.assemble(basis) @ T).tocsc()).solve(right)
-    return (found * right).sum(axis=0)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    "size, cells, lag",
-    [
-        ((0.6, 0.16, 0.08), (20, 6, 4), 0.012),
-        pytest.param((0.5, 0.2, 0.05), (20, 8, 4), 0.045, marks=pytest.mark.slow),
-    ],
-)
-def test_short_wide_boxes(size, cells, lag):
-    """Solids are met to 0.5 % where wide sides lag behind the theory of beams (shear lag)."""
-    # With cells half as large the solids are 0.3 % softer in torsion, where they differ most.
-    solids = box_of_solids(size, 20)
-    assert np.abs(solids / box(size) - 1.0).max() > lag
-    assert flexibility("box", size, cells) == pytest.approx(solids, rel=5e-3)
 
 
 KEYS = ("wall=0.002", "min_wall=0.001", "max_wall=0.005", "hollow=true")

@@ -56,46 +56,6 @@ def test_cells_have_the_densities_of_their_partners(projection):
         assert 0.0 in known[0] and 1.0 in known[0]  # regions and solid ends, too
 
 
-LIMITED = "constraints.tip_deflection=1e-4", "constraints.first_frequency=50.0"
-MOVED = ("objective.gradient=exact", "simulation.tolerance=1e-7", "motion.horizon=2.2",
-         "constraints.deviation=0.02")  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        (*SCALED, *LIMITED, "objective.kind=static"),
-        (*REPEATED, REGIONS, *MOVED, "objective.kind=peak_force"),
-        pytest.param((*REPEATED, REGIONS, *MOVED, "objective.kind=stress"),
-                     marks=pytest.mark.serial),
-    ],
-)  # fmt: skip
-def test_gradients_by_the_design_of_both_arms(changes):
-    """Every arm's own limits, one volume; a void cell has no say: by central differences."""
-    scene, partition, arms = built(*changes)
-    evaluator = Evaluator(scene, partition, arms, do.Profile())
-    variables = evaluator.variables
-    x = variables.join({k: waves(arms[k]) for k in arms if k == 0})
-    x = np.clip(x, variables.xmin, variables.xmax)
-    free = variables.xmin < variables.xmax
-    direction = np.where(free, np.cos(1.7 * np.arange(x.size)), 0.0)
-    [here] = evaluator.evaluate(x)
-    assert np.isfinite(here.objective).all() and np.isfinite(here.constraints).all()
-    # p-means jump by 1e-4 where an instant falls below their limit: here 7e-5 away.
-    h = 1e-5
-    pairs = [evaluator.evaluate(x + sign * h * direction)[0].evaluation for sign in (1, -1)]
-    ahead, behind = (np.array([one.objective, *one.constraints]) for one in pairs)
-    slopes = np.vstack([here.objective, here.constraints]) @ direction
-    counted = slice(None) if "objective.kind=static" in changes else slice(1)
-    differences = (ahead - behind) / (2.0 * h)
-    np.testing.assert_allclose(slopes[counted], differences[counted], rtol=1e-5)
-    if counted == slice(None):
-        names = [(one.response, one.arms) for one in here.evaluation.responses[1:]]
-        both = ("arm1", "arm2")
-        limits = [("eigenfrequency", both), ("tip_deflection", both)]
-        assert names == [("volume_fraction", ("arm1",)), *limits]
-
-
 def test_any_number_of_ranks_ends_in_the_same_design():
     scene = do.load_scene(TWO_ARM, SCALED)
     together, alone = do.optimize(scene), do.optimize(scene, world=MPI.COMM_SELF)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from mpi4py import MPI
-from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, YOUNG, solid_arm, solid_scene
+from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, solid_arm, solid_scene
 
 from dolfinopt.arms.arm import Arm
 from dolfinopt.errors import InputError
@@ -73,32 +73,6 @@ def response(weights: ShapeIntegrals) -> Callable[[ShapeIntegrals], float]:
     return lambda body: sum(float(np.sum(by * getattr(body, name))) for name, by in pairs)
 
 
-def stiffness_with(body: ShapeIntegrals, loads: np.ndarray) -> np.ndarray:
-    """Return K + a M + sum_p loads_p K0_p (q, q), a = 4e5 1/s2."""
-    M = body.W[[0, 4, 8], 1:, 1:].sum(axis=0)
-    K0 = np.concatenate([body.K0, body.K0_outboard])
-    return body.K + 4e5 * M + np.tensordot(loads, K0, 1)
-
-
-def spectrum(body: ShapeIntegrals, loads: np.ndarray) -> float:
-    """Return a function of the basis' span alone: the interface's response at imaginary shifts."""
-    inverse = np.linalg.inv(stiffness_with(body, loads))
-    return float(np.trace(body.outboard @ inverse @ body.outboard.T) * 1e4)
-
-
-def by_spectrum(body: ShapeIntegrals, loads: np.ndarray) -> ShapeIntegrals:
-    """Return its derivatives."""
-    B = body.outboard @ np.linalg.inv(stiffness_with(body, loads))
-    zero = {one.name: 0.0 * np.asarray(getattr(body, one.name)) for one in TABLE} | {"mass": 0.0}
-    zero["K"] = by_K = -1e4 * B.T @ B
-    zero["outboard"] = 2e4 * B
-    zero["W"][[0, 4, 8], 1:, 1:] = 4e5 * by_K
-    if len(loads):
-        by_K0 = loads[:, None, None] * by_K
-        zero["K0"], zero["K0_outboard"] = by_K0[:12], by_K0[12:]
-    return ShapeIntegrals(**zero)
-
-
 Function = Callable[[ShapeIntegrals], float]
 
 
@@ -135,21 +109,6 @@ def test_three_interfaces():
     assert not arm.substructure.joins(ends)
 
 
-@pytest.mark.serial
-def test_force_between_the_ends():
-    """A beam loaded at a section between its ends: deflections there and, beyond it, of the end."""
-    ring = Interface(name="ring", point=(0.2625, 0.0, 0.0), radius=0.021)  # a layer of cells
-    arm = solid_arm(cells=(20, 4, 2), coordinates=12, interfaces=(ring,))
-    S = arm.state(np.ones(arm.mesh.num_cells)).elastic.constraint_modes.stiffness
-    moved = np.linalg.inv(S)[:, 7]  # by 1 N along y at the ring
-    bending = YOUNG * THICKNESS * HEIGHT**3 / 12.0
-    a = ring.point[0]
-    slope = a**2 / 2.0 / bending
-    expected = a**3 / 3.0 / bending, a**3 / 3.0 / bending + slope * (LENGTH - a), slope, slope
-    assert moved[[7, 1, 11, 5]] == pytest.approx(expected, rel=0.03)
-    assert moved[1] - moved[7] == pytest.approx(moved[11] * (LENGTH - a), rel=1e-3)
-
-
 @pytest.mark.parametrize("radius", [0.001, 0.3])
 def test_refused_interfaces(radius):
     """Of no side, and with nodes of another one: one line on all ranks."""
@@ -176,33 +135,6 @@ def test_gradient_of_a_body(cells, stiffening, interfaces):
     weights["outboard_point"] *= 0.0
     by = ShapeIntegrals(**weights)
     assert remainders(arm, response(by), by)[-1] == pytest.approx(2.0, abs=0.06)
-
-
-@pytest.mark.parametrize(
-    ("method", "coordinates", "shifts"),
-    [
-        *((method, 8, (0.0,)) for method in ("craig-bampton", "modal", "krylov")),
-        pytest.param("krylov", 6, (200.0,), marks=pytest.mark.serial),
-        pytest.param("krylov", 20, (0.0,), marks=pytest.mark.serial),
-    ],
-)
-def test_gradient_of_a_basis(method, coordinates, shifts):
-    """With modes, of which the span alone counts; the last of an arm with two interfaces."""
-    told = {"cells": (8, 3, 2)} if coordinates < 20 else {"cells": (10, 4, 2)}
-    told |= {"interfaces": FORK[: coordinates // 20]}
-    told |= {
-        "method": method,
-        "coordinates": coordinates,
-        "frequencies": shifts if method == "krylov" else None,
-    }
-    arm = solid_arm(stiffening=True, **told)
-    body = arm.state(arm.mesh.keep(rough(arm))).body
-    K0 = np.concatenate([body.K0, body.K0_outboard])
-    inverse = np.linalg.inv(np.linalg.cholesky(body.K))
-    loads = 0.02 / np.linalg.norm(inverse @ K0 @ inverse.T, axis=(1, 2), ord=2)
-    by = by_spectrum(body, loads)
-    rates = remainders(arm, lambda one: spectrum(one, loads), by)
-    assert rates[-1] == pytest.approx(2.0, abs=0.06)
 
 
 @pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")
