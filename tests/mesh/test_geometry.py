@@ -10,7 +10,6 @@ import pytest
 from dolfinx.fem import locate_dofs_topological
 from mpi4py import MPI
 from runs import refusal
-from scipy.spatial import cKDTree
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
@@ -106,26 +105,6 @@ def test_bores_are_interfaces_in_solid_rings(shape, passive, ring):
     assert np.array_equal(mesh.outboard_point, [LENGTH, 0.0])
 
 
-@pytest.mark.serial
-@pytest.mark.parametrize("shape", SHAPES)
-def test_meshes_of_the_arm_with_bores(shape):
-    """Their area converges, polygons in place of circles, by order 2; sizes of cells; symmetry."""
-    exact = LENGTH * HEIGHT + np.pi * (0.25 * HEIGHT**2 - 2.0 * BORE**2)
-    sizes = HEIGHT / np.array([6.0, 12.0, 24.0])
-    meshes = [bores(mesh_size=size, cell_shape=shape) for size in sizes]
-    errors = [abs(COMM.allreduce(mesh.area.sum()) / exact - 1.0) for mesh in meshes]
-    assert errors[-1] < 1e-4  # 4.2e-5
-    assert 1.7 < np.polyfit(np.log(sizes), np.log(errors), 1)[0] < 2.3  # 1.93
-    for size, mesh in zip(sizes, meshes):
-        middle = np.abs(mesh.centroid[:, 0] - 0.5 * LENGTH) < 0.25 * LENGTH
-        typical = np.median(collect(mesh.area[middle])) / (0.5 if shape == "triangle" else 1.0)
-        assert 0.6 < np.sqrt(typical) / size < 1.1  # equilateral triangles: sqrt(0.87)
-    centroid = collect(meshes[0].centroid)
-    distance, pair = cKDTree(centroid).query(centroid * [1.0, -1.0])
-    assert distance.max() < 1e-7 * HEIGHT  # Gmsh places points of curves to 1e-9 of their length
-    assert np.array_equal(pair[pair], np.arange(len(pair)))
-
-
 PLAIN = """
 Point(1) = {0, -0.03, 0, 0.02}; Point(2) = {0.5, -0.03, 0, 0.02};
 Point(3) = {0.5, 0.03, 0, 0.02}; Point(4) = {0, 0.03, 0, 0.02};
@@ -210,23 +189,6 @@ def test_passive_cells_lie_within_passive_of_an_interface(write):
     x = mesh.centroid[:, 0]
     assert np.array_equal(mesh.passive, np.minimum(x, LENGTH - x) < 0.07)
     assert 0 < COMM.allreduce(int(mesh.passive.sum())) < COMM.allreduce(mesh.num_cells)
-
-
-@pytest.mark.serial  # Gmsh runs on one rank
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("version", [2.2, 4.1])
-def test_mesh_file_holds_what_its_geometry_did(shared_tmp_path, shape, version):
-    def make(gmsh):
-        gmsh.onelab.setNumber("Parameters/1 length (m)", [LENGTH])
-        gmsh.onelab.setNumber("Parameters/3 mesh size (m)", [0.01])
-        gmsh.onelab.setNumber("Parameters/6 cell shape", [float(shape == "quadrilateral")])
-        gmsh.open(BORES)
-        gmsh.model.mesh.generate(2)
-        gmsh.option.setNumber("Mesh.MshFileVersion", version)
-
-    path = gmsh_writes(shared_tmp_path / "arm.msh", make)
-    expected = figures(bores(mesh_size=0.01, cell_shape=shape))
-    np.testing.assert_allclose(figures(arm_mesh(COMM, entry(path))), expected, rtol=1e-12)
 
 
 def plate(occ):
@@ -651,62 +613,3 @@ def test_gmsh_may_end_its_own_process_alone_and_ctrl_c_ends_it(monkeypatch):
 
 
 # -- names in STEP files: a text written out by hand, a square with a hole, in millimetres  -------
-
-
-# As programs write it: spaces and line ends anywhere, comments of a kind in strings.
-SQUARE = """ISO-10303-21;
-DATA;
-#1=CARTESIAN_POINT('a; #2 (b)',(0.,0.,0.)); #2=CARTESIAN_POINT('',(40.,0.,0.));
-#3=CARTESIAN_POINT('',(4.E+01,2.0E1,0.)); #4=CARTESIAN_POINT('',(0,20,0));
-#5=CARTESIAN_POINT('',(1.5E+01,1.E+01,0.)); #6=CARTESIAN_POINT('centre',(10.,10.,0.));
-#11 = VERTEX_POINT ( '', #1 ); #12=VERTEX_POINT('',#2); #13=VERTEX_POINT('',#3);
-#14=VERTEX_POINT('',#4); #15=VERTEX_POINT('',#5);
-#21=EDGE_CURVE('Inboard ',#11,
-  #14,#90,.T.);
-#22=EDGE_CURVE('it''s',#11,#12,#91,.T.); #23=EDGE_CURVE('',#12,#13,#92,.T.);
-#24=EDGE_CURVE('',#13,#14,#93,.T.); #25=EDGE_CURVE('outboard',#15,#15,#94,.T.);
-#31=ORIENTED_EDGE('',*,*,#21,.T.); #32=ORIENTED_EDGE('',*,*,#22,.T.);
-#33=ORIENTED_EDGE('',*,*,#23,.T.); #34=ORIENTED_EDGE('',*,*,#24,.T.);
-#35=ORIENTED_EDGE('',*,*,#25,.F.);
-#41=EDGE_LOOP('',(#31,#32,#33,#34)); #42=EDGE_LOOP('',(#35));
-#51=FACE_OUTER_BOUND('',#41,.T.); #52=FACE_BOUND('',#42,.T.);
-#61=ADVANCED_FACE('passive',(#51,#52),#95,.T.);
-#94=CIRCLE('hole',#96,5.); #96=AXIS2_PLACEMENT_3D('',#6,$,$);
-#97=( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT(.MILLI.,.METRE.) );
-ENDSEC;
-"""
-CORNERS = 1e-3 * np.array([[0, 0, 0], [40, 0, 0], [40, 20, 0], [0, 20, 0]])  # m
-HOLE = 1e-3 * np.array([[15.0, 10.0, 0.0]])  # m
-EVERYWHERE = np.concatenate([CORNERS, HOLE])
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    ("points", "names"),
-    [
-        (CORNERS[[0, 3]], {"inboard"}),
-        (CORNERS[[3, 0]], {"inboard"}),  # the other way round
-        (CORNERS[[3, 0]] + 1e-9, {"inboard"}),
-        (CORNERS[[3, 0]] + 1e-6, set()),
-        (HOLE[[0, 0]], {"outboard"}),  # closed: begins where it ends
-        (CORNERS[[1, 2]], set()),  # bears no name
-        (CORNERS[[0, 2]], set()),  # no edge
-        (CORNERS[[0, 0]], set()),  # one of its ends
-    ],
-)
-def test_edges_are_found_by_their_ends(points, names):
-    edges, _ = read_shapes(SQUARE)
-    assert edges.names_at(points, EVERYWHERE) == names
-
-
-@pytest.mark.serial
-def test_faces_are_found_by_all_their_vertices_in_any_unit():
-    edges, faces = read_shapes(SQUARE)
-    assert faces.names == ["passive"]
-    assert faces.names_at(np.tile(EVERYWHERE, (2, 1)), EVERYWHERE) == {"passive"}
-    assert faces.names_at(CORNERS, EVERYWHERE) == set()
-    for factor in (1e3, 1.0 / 0.0254):
-        assert edges.names_at(CORNERS[[0, 3]] * factor, EVERYWHERE * factor) == {"inboard"}
-    edges, faces = read_shapes("ISO-10303-21;\nDATA;\nENDSEC;\n")
-    assert edges.names == faces.names == []
-    assert edges.names_at(CORNERS, EVERYWHERE) == set()

@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import ROOT, refusal, refused
-from solids import HEIGHT, LENGTH, THICKNESS, solid_arm, solid_scene
+from solids import HEIGHT, LENGTH, THICKNESS, solid_arm
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm as Flexible
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
 from dolfinopt.mesh.checks import cell_sizes, check_cells, facet_corners
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
-from dolfinopt.mesh.hollow import Member, Wall, box_hull, hull_of, stations, tube_hull
+from dolfinopt.mesh.hollow import Member, Wall, box_hull, tube_hull
 from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
-from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.joints import Interface
 
@@ -119,20 +117,6 @@ def test_step_without_names(shared_tmp_path, bored):
     assert COMM.allreduce(np.array(ends)).min() >= 8
 
 
-def test_body_of_a_step_file(shared_tmp_path):
-    """Quadratic tetrahedra, from file to floating body: six coordinates, the solid's inertia."""
-    path = written(shared_tmp_path, "bar.step", bored=False)
-    keys = {"cells": None, "mesh": str(path), "mesh_size": 0.015, "cell_shape": "tetrahedron"}
-    scene = solid_scene(**keys, filter_radius=0.02)
-    arm = Flexible(scene, 0, COMM, Profile())
-    body = arm.reduce(arm.physical(np.ones(arm.mesh.num_cells)))
-    mass = 2700.0 * LENGTH * HEIGHT * THICKNESS
-    assert body.mass == pytest.approx(mass, rel=1e-9)
-    assert body.W[0, 0, 0] == pytest.approx(mass * LENGTH**2 / 3.0, rel=1e-9)
-    bending = 3.0 * 70e9 * THICKNESS * HEIGHT**3 / 12.0 / LENGTH**3
-    assert np.linalg.inv(body.K)[1, 1] * bending == pytest.approx(1.0, abs=0.02)
-
-
 def row_of_cubes(path: Path) -> Path:
     """Write one layer of hexahedra along the arm as Gmsh's file."""
     places = [(x, y, z) for x in np.linspace(0.0, LENGTH, 3) for y in (-0.5, 0.5)
@@ -211,19 +195,6 @@ def test_the_wall_has_the_volume_of_its_section(hull, area):
     check_cells(mesh.points, mesh.cells[:, TENSOR[8, 3]])
     assert cell_sizes(mesh.points[mesh.cells[:, TENSOR[8, 3]]]).sum() == pytest.approx(area * 0.5)
     assert len(mesh.inboard) == len(mesh.outboard) == hull.shape[1]
-
-
-def test_the_wall_of_a_cone_is_as_thick_as_it_says():
-    """Between two cones of half angle a and distance t along the normal; to (pi / r)^2 / 6."""
-    around, slope, t = 120, 0.4, 0.002
-    x, turns = stations(0.5, 8), 2.0 * np.pi * np.arange(around) / around
-    radius = 0.3 - slope * x
-    outer = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    points = np.empty((len(x), around, 3))
-    points[:, :, 0], points[:, :, 1:] = x[:, None], radius[:, None, None] * outer
-    inner = hull_of(points).points(t).reshape(2, len(x), around, 3)[1]
-    found = (radius[:, None] - np.hypot(*inner[:, :, 1:].transpose(2, 0, 1))) / np.hypot(1.0, slope)
-    assert found == pytest.approx(np.full_like(found, t), rel=1e-3)
 
 
 def test_thickness_follows_the_cells_and_gradients_go_back():
