@@ -1,6 +1,5 @@
 """The scene: defaults, inheritance, overrides, and one helpful line for every kind of bad input."""
 
-import copy
 import json
 import math
 import pickle
@@ -72,18 +71,6 @@ def test_scene_is_frozen_hashable_and_picklable():
     assert scene != str(TWO_ARM)
 
 
-def test_round_trip_through_json():
-    data = minimal(3, payload={"mass": 4, "inertia": 0.1}, simulation={"sample": 0.002})
-    data["arms"][1] |= {"length": 0.7, "cells": [70, 6]}
-    before = copy.deepcopy(data)
-    scene = scene_from_dict(data, overrides=["motion.gravity=[0, -9.81]", "arms.height=0.05"])
-    assert data == before  # what was given is left as it was
-    plain = json.loads(json.dumps(scene.to_dict(), allow_nan=False))
-    assert plain == scene.to_dict()  # lists, not tuples
-    assert scene_from_dict(plain) == scene
-    assert "source" not in plain
-
-
 @pytest.mark.parametrize(
     ("paths", "value"),
     [
@@ -123,21 +110,6 @@ def test_reducible_dofs():
     assert Arm(**ARM, cells=(3, 2), element="incompatible").n_reducible == 2 * 3 * 2 + 3
     # Nodes halfway, too: 5 columns of 5.
     assert Arm(**ARM, cells=(3, 2), element="quadratic").n_reducible == 2 * 5 * 5 + 3
-
-
-@pytest.mark.parametrize("n_along", [1, 2, 3, 7, 200])
-@pytest.mark.parametrize("length", [0.7, 1.0])
-def test_passive_share_counts_centroids(n_along, length):
-    for tenths in range(5 * n_along):  # of a cell
-        if tenths % 10 == 5:
-            continue  # on a centroid, where rounding decides
-        passive = 0.1 * tenths * length / n_along
-        arm = Arm(**ARM | {"length": length}, cells=(n_along, 3), passive=passive)
-        n_solid = sum(10 * i + 5 < tenths for i in range(n_along))  # free of rounding
-        assert arm.passive_columns == n_solid
-        assert arm.passive_share == pytest.approx(2 * n_solid / n_along, abs=1e-15)
-    # A centroid on the border, a number without rounding, is not solid.
-    assert Arm(**ARM, cells=(2, 1), passive=0.25).passive_columns == 0
 
 
 def test_ends_are_solid_unless_the_scene_says_otherwise():
