@@ -10,10 +10,8 @@ from remainders import built_of
 from runs import TWO_ARM, by_root, contents, summary_of
 
 import dolfinopt as do
-from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import run_folder as results
-from dolfinopt.output.design import gather_views
 from dolfinopt.output.run_folder import write_result
 
 WORLD = MPI.COMM_WORLD
@@ -230,15 +228,3 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         write_result(shared_tmp_path, one, 1.0)
     assert not (shared_tmp_path / "summary.json").exists()
-
-
-@pytest.mark.parametrize("element", [*ELEMENTS])
-def test_views_of_arms_without_a_current_design(element):
-    """Designs that studies read but never assembled; nodes between corners are not drawn."""
-    built = built_of(do.load_scene(TWO_ARM, [*SMALL, f"arms.element={element}"]))
-    views = gather_views(built.scene, built.partition, built.arms, built.uniform())
-    if WORLD.rank == 0:
-        assert [view.name for view in views] == ["arm1", "arm2"]
-        for view in views:
-            assert view.corners.shape == (60, 4, 2) and view.modes.shape[-1] == 0
-            assert view.corners[..., 0].max() - view.corners[..., 0].min() == pytest.approx(1.0)
