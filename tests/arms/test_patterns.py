@@ -8,7 +8,7 @@ from mpi4py import MPI
 from runs import STATED, TWO_ARM, overrides, refused, run, summary_of
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm, Patterns, uniform_design
+from dolfinopt.arms.arm import Arm, Patterns
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.output.design import read_design
 from dolfinopt.parallel import Partition
@@ -79,18 +79,6 @@ def test_an_arm_on_two_ranks_has_partners_on_both():
     [back] = patterns.collect({1: u - v}).items()
     assert back[0] == 0
     np.testing.assert_allclose(back[1], x * 0.8 - y * 0.75, rtol=1e-9, atol=1e-12)
-
-
-def test_the_uniform_design():
-    scene, partition, arms = built(*SCALED)
-    uniform = uniform_design(scene, partition, arms, 0.3)
-    assert sorted(uniform) == sorted(arms)
-    for k, x_phys in uniform.items():
-        passive = arms[k].mesh.passive
-        assert passive.sum() == 2 * 2 * 4 and (x_phys[passive] == 1.0).all()
-        assert np.ptp(x_phys) > 0.5  # filtered at the ends of the pattern
-    volume = [arms[k].volume_fraction(x) for k, x in uniform.items()]
-    assert np.ptp(WORLD.allreduce(volume)) < 1e-12
 
 
 @pytest.mark.serial  # ranks: test_any_number_of_ranks_ends_in_the_same_design
@@ -208,24 +196,6 @@ def test_a_state_is_computed_once_and_lasts() -> None:
     assert np.abs(residual).max() < 1e-8  # of forces of 1 N
     with pytest.raises(ValueError, match="read-only"):
         state.x_phys[0] = 0.0
-
-
-@pytest.mark.serial
-def test_what_states_share() -> None:
-    """Another order or scene reduces anew only where it must; the factor at hand serves all."""
-    arm = small_arm()
-    counts = arm.profile.counts
-    x = arm.uniform(0.5)
-    body = arm.reduce(x)
-    changes = ("arms.cells=[16,3]", "damping.stiffness_proportional=1e-3")
-    damped = arm.under(do.load_scene(TWO_ARM, changes))
-    assert damped.basis is arm.basis
-    assert np.allclose(damped.reduce(x).D, 5.0 * body.D, rtol=1e-12)
-    assert counts.reductions == 1
-    arm.set_order(6)
-    assert arm.basis is None and arm.reduce(x).num_modes == 6
-    assert damped.reduce(x).num_modes == 4
-    assert (counts.reductions, counts.factorisations, counts.assemblies) == (2, 1, 2)
 
 
 @pytest.mark.serial

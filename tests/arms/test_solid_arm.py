@@ -173,17 +173,3 @@ def test_averages_of_a_design():
         change = w @ (arm.physical(x + 0.01 * along) - y) / 0.01
         sums = COMM.allreduce(np.array([change, arm.backward(w) @ along]))
         assert sums[0] == pytest.approx(sums[1], rel=1e-9)
-
-
-def test_filter_in_space():
-    """Volume and constants kept, second moments those of the cone in all three directions."""
-    arm = solid_arm(cells=(50, 8, 8), filter_radius=0.012, passive=0.0)
-    x, mesh = np.zeros(arm.mesh.num_cells), arm.mesh
-    centre = np.array([0.255, 0.0025, 0.00125])
-    x[np.linalg.norm(mesh.centroid - centre, axis=1) < 1e-6] = 1.0
-    y = arm.filter.forward(x)
-    total = COMM.allreduce(np.array([mesh.area @ x, mesh.area @ y]))
-    assert total[1] == pytest.approx(total[0], rel=1e-12)
-    assert np.allclose(arm.filter.forward(np.ones(len(x))), 1.0, rtol=1e-12)
-    along = COMM.allreduce((mesh.area * y) @ (mesh.centroid[:, 0] - centre[0]) ** 2) / total[1]
-    assert along == pytest.approx(0.012**2 / 6.0, rel=1e-6)

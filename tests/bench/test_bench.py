@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from runs import TWO_ARM, refusal, refused, run
 
-from dolfinopt.bench import field, iterations, measure, panel, solid
+from dolfinopt.bench import accuracy, field, iterations, measure, panel, solid
 from dolfinopt.bench import run as benches
 from dolfinopt.bench.measure import Plan
-from dolfinopt.bench.panel import Diagram, Frame, fitted_power, least_x
+from dolfinopt.bench.panel import Diagram, Frame, fitted_power
 from dolfinopt.bench.run import Goal, goal_table
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.paper.reproduction import load_paper
@@ -162,13 +162,6 @@ def test_fitted_power():
     assert math.isnan(fitted_power(Frame({"x": x[:1], "y": x[:1]})))
 
 
-def test_least_x_interpolates():
-    """Between its points, log over log; a curve that does not get there ends with a bound."""
-    curve = Frame([(1.0, 1e-3), (100.0, 1e-5)], columns=["seconds", "error"])
-    assert least_x(curve, 1e-4) == pytest.approx(10.0) and least_x(curve, 1e-3) == 1.0
-    assert least_x(curve, 1e-6) == pytest.approx(100.0)
-
-
 # -- goals -----------------------------------------------------------------------------------
 
 
@@ -185,6 +178,31 @@ def test_goals_are_met_or_not_or_not_measured():
     assert verdict(2.0, False) == ("at most 2", "2", "yes") and verdict(2.1, False)[2] == "no"
     assert verdict(2.1, True) == ("at least 2", "2.1", "yes") and verdict(1.9, True)[2] == "no"
     assert verdict(math.nan, True) == ("at least 2", "not measured", "")
+
+
+def measures(diagram, **frames):
+    """Return what the diagram's goals measure of rows, by what they say."""
+    mine = [goal for goal in benches.GOALS if goal.diagram == diagram]
+    return {goal.what: goal.measure(frames[diagram]) for goal in mine}
+
+
+def test_goals_of_simulations():
+    """The slower design; SciPy's seconds at our error, or a bound where no method got there."""
+    usual = accuracy.USUAL, accuracy.USUAL_TOLERANCE
+
+    def found(*rows):
+        frame = accuracy.MOTION.frame([(d, 4, *of, s, e) for d, of, s, e in rows])
+        seconds, _, ratio, _ = measures("time", time=frame).values()
+        return seconds, ratio
+
+    ours = ("a", usual, 0.1, 1e-5)
+    bdf, lsoda = ("SciPy BDF", 0.0), ("SciPy LSODA", 0.0)
+    slow = [("a", bdf, 1.0, 1e-3), ("a", bdf, 100.0, 1e-7)]
+    assert found(ours, *slow) == (0.1, pytest.approx(100.0))
+    # One that stopped at 3 s, short of the error, takes more: a bound.
+    assert found(ours, *slow, ("a", lsoda, 3.0, 1e-4))[1] == pytest.approx(30.0)
+    assert found(ours, *slow, ("a", lsoda, 20.0, 1e-4))[1] == pytest.approx(100.0)
+    assert found(ours, *slow, ("b", usual, 0.2, 1e-5))[0] == 0.2
 
 
 @pytest.mark.parametrize("name", iterations.problems())

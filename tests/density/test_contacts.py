@@ -59,15 +59,6 @@ def test_drawings(rows, pieces, corners, kept, joins):
 
 
 @pytest.mark.serial
-def test_the_order_of_cells_does_not_matter():
-    cells, solid = drawn("######", "#..###", "###..#", "######")
-    order = np.random.default_rng(0).permutation(len(cells))
-    one, other = found(cells, solid), found(cells[order], solid[order])
-    assert np.array_equal(one.kept[order], other.kept)
-    assert np.array_equal(one.places, other.places) and one.places.tolist() == [[0.75, 0.5]]
-
-
-@pytest.mark.serial
 def test_contacts_of_solids():
     """Cubes meet in faces, edges or corners; a corner of cubes that share an edge is none more."""
     cells, places = grid(4, 2, 2, step=STEP)

@@ -55,21 +55,6 @@ def test_published_values(law, x, stiffness, mass):
     assert at.mass == pytest.approx([mass], rel=ROUNDING, abs=1.01 * FLOOR**2)
 
 
-@pytest.mark.parametrize("penalty", [1.0, 2.0, 3.0, 4.5])
-def test_laws_at_the_switch(penalty):
-    """Pedersen's is continuous, its slope jumps from e / x to p e / x; Du and Olhoff's is smooth.
-
-    Of the latter terms of 36 and 35 cancel to a slope of 1: some units of rounding of 36.
-    """
-    switch = [np.nextafter(SWITCH, 0.0), SWITCH]
-    at = values(switch, "pedersen", penalty)
-    assert np.diff(at.stiffness)[0] == pytest.approx(0.0, abs=1e-15)
-    assert at.stiffness_slope[1] == pytest.approx(penalty * at.stiffness_slope[0], rel=1e-14)
-    at = values(switch, "du-olhoff", penalty)
-    for jump in map(np.diff, (at.stiffness, at.stiffness_slope, at.mass, at.mass_slope)):
-        assert abs(jump[0]) < 1e-13
-
-
 # -- slopes ----------------------------------------------------------------------------------
 
 

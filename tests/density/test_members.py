@@ -175,17 +175,6 @@ def test_widths_of_solids():
     assert none is None and whole.size == pytest.approx(3.0 * CELL, abs=CELL / 4.0)
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_a_rod_between_blocks() -> None:
-    """Blocks six times as thick, whose edges are as wide as the rod, do not hide it."""
-    boxes, places = grid(36, 12, 12, step=CELL)
-    i, j, k = places.T
-    rod = (abs(j - 5.5) < 1.0) & (abs(k - 5.5) < 1.0)
-    member, _ = thinnest(boxes, (i < 12) | (i >= 24) | rod, CELL)
-    assert member.size == pytest.approx(2.0 * CELL, abs=1.001 * CELL / 4.0)
-    assert 12.0 < member.place[0] / CELL < 24.0
-
-
 @pytest.mark.serial
 @pytest.mark.parametrize(("volume", "misses"), [(0.5, False), (0.3, True)])
 def test_widths_that_are_missed_are_told(volume, misses, tmp_path, capsys):

@@ -95,19 +95,6 @@ def test_friction_while_a_joint_turns_round() -> None:
     assert error < 1e-5  # 2e-7
 
 
-def test_stiff_springs_are_rigid_drives() -> None:
-    """The motors' inertia acts on the joints then; the rest falls with the spring's softness."""
-    rigid = machine(simulated(small(ROTORS, motion=EARTH)))[0]
-    left = []
-    for stiffness in (2e6, 2e7):
-        spring = {"joint_stiffness": stiffness, "joint_damping": 1e-3 * stiffness}
-        soft = machine(simulated(small(ROTORS | spring, motion=EARTH)))[0]
-        assert soft.problem.num_coordinates == rigid.problem.num_coordinates + 2
-        left.append(apart(soft.deviation, rigid.deviation))
-    assert left[0] / left[1] == pytest.approx(10.0, rel=0.05)
-    assert left[1] < 5e-3  # the joints' own springs are a thousandth of this
-
-
 def test_angles_of_motors_are_written(tmp_path) -> None:
     """At rest under gravity the drives give what the springs between motor and arm give."""
     gains = "control={stiffness=[2e5, 2e4, 2e4], damping=[2e4, 600.0, 600.0]}"

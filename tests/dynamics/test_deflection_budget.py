@@ -50,24 +50,6 @@ def held_level(tmp_path, **changes) -> Tree:
                             "objective": {"kind": "deviation"}, **changes})  # fmt: skip
 
 
-def test_statics_in_the_plane(tmp_path) -> None:
-    """A load across a level arm: what bends, gives way and turns, each by its own formula."""
-    budget = budget_of(held_level(tmp_path))
-    found, arm, reach = by_part(budget), LENGTHS[1], sum(LENGTHS)
-    inertia, area, shear = 0.02 * 0.05**3 / 12.0, 0.02 * 0.05, 70e9 / 2.66
-    bent = WEIGHT * (arm**3 / (3.0 * 70e9 * inertia) + arm / (5.0 / 6.0 * shear * area))
-    # To first order in what gives way; the largest angle is 4e-3 rad.
-    assert found["bearing", "arm"] == pytest.approx(WEIGHT * (1 / 5e5 + arm**2 / 3e4), rel=1e-4)
-    assert found["gear", "arm"] == pytest.approx(WEIGHT * arm**2 / GEAR, rel=1e-4)
-    assert found["control", "arm"] == pytest.approx(WEIGHT * arm**2 / GAIN, rel=1e-4)
-    assert found["control", "beam"] == pytest.approx(WEIGHT * reach**2 / GAIN, rel=1e-4)
-    assert found["link", "arm"] == pytest.approx(bent, rel=6e-3)  # the clamped end of plane cells
-    assert budget.linear == pytest.approx(sum(found.values()), rel=1e-14)
-    assert budget.linear == pytest.approx(budget.deviation, rel=1e-4)
-    assert sum(budget.shares.values()) == pytest.approx(1.0, rel=1e-14)
-    assert list(budget.shares) == ["links", "bearings", "gears", "control error"]
-
-
 def test_softer_parts_are_the_linear_whole(tmp_path) -> None:
     """What the sum leaves out is of second order of itself: a tenth of the load, a hundredth."""
     apart = []

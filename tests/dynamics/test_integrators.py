@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from bodies import (
 )
 from machines import distance
 from remainders import build
-from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import adjoint, march, measured, newton, newton_matrix, radau
 from dolfinopt.dynamics.adjoint import Adjoint
@@ -161,27 +160,6 @@ def test_relative_error_is_of_the_worst_arm() -> None:
     assert relative_error(mechanism, error, q) == pytest.approx(1e-3 / 4e-3, rel=1e-14)
     nothing = relative_error(mechanism, error, 0.0 * q)  # to compare with: the error itself
     assert nothing == pytest.approx(0.2 * np.sqrt(K), rel=1e-14)
-
-
-def test_large_deflections_are_solved_from_rest() -> None:
-    """Arms that bend by 0.45 rad, far from where Newton starts, against SciPy."""
-    problem = two_arms(payload=2.0, bending=1.0, axial=30.0, damping=0.0)
-    found, t = solve(problem, 1e-5), np.linspace(0.0, 1.0, 101)
-    turn = np.kron(np.eye(2), problem.mechanism.bodies[0].outboard[2])
-    assert np.abs(found.q @ turn.T).max() > 0.4
-    q, qd = problem.initial_state()
-
-    def rate(now: float, y: np.ndarray) -> np.ndarray:
-        at, (a, b) = problem.at(np.array([now])), y.reshape(2, 1, 6)
-        mass = at.linearise(a, b, 0.0 * a).dense()[0, :, 12:]
-        return np.append(b, np.linalg.solve(mass, -at.residual(a, b, 0.0 * a)[0]))
-
-    y, right = np.append(q, qd), np.empty((101, 6))
-    for ends in pairwise(ENDS):
-        done = solve_ivp(rate, ends, y, "DOP853", rtol=1e-7, atol=1e-9, dense_output=True)
-        here, y = (t >= ends[0]) & (t <= ends[1]), done.y[:, -1]
-        right[here] = done.sol(t[here])[:6].T
-    assert relative_error(problem.mechanism, found.sample(t) - right, right) <= 1e-5
 
 
 def soft_arms() -> MachineSystem:

@@ -15,7 +15,7 @@ from dolfinopt.dynamics.linearised import Linearised
 from dolfinopt.dynamics.poles import poles_of
 from dolfinopt.dynamics.state_space import StateSpace
 from dolfinopt.responses.linearised_machine import accurate_below
-from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial
 MODULUS, DENSITY, LENGTH, HEIGHT, THICKNESS = 70e9, 2700.0, 1.0, 0.02, 0.01
@@ -57,16 +57,6 @@ def test_free_drive_leaves_a_pendulum(tmp_path) -> None:
     bent = LENGTH**3 / (12.0 * MODULUS * THICKNESS * HEIGHT**3 / 12.0)
     across = found.outputs.index("deflection x")
     assert gain[across, 1] == pytest.approx(bent, rel=3e-3)
-
-
-def test_stiff_drive_clamps_the_beam(tmp_path) -> None:
-    """Euler and Bernoulli's frequencies of a cantilever, 0.1 to 0.4 % above Timoshenko's."""
-    gains = {"stiffness": [1e9], "damping": [0.0]}
-    found = state_space(hanging(tmp_path, 0.0, control=gains), 0.0)
-    exact = np.array([1.875104, 4.694091, 7.854757]) ** 2 / (2.0 * np.pi)
-    exact *= np.sqrt(MODULUS * HEIGHT**2 / (12.0 * DENSITY)) / LENGTH**2
-    assert found.closed
-    assert found.arrays()["frequencies"][:6:2] == pytest.approx(exact, rel=5e-3)
 
 
 def machine_at(trajectory: Trajectory, t: float) -> Linearised:
@@ -226,53 +216,6 @@ def of_second_order(M: np.ndarray, D: np.ndarray, K: np.ndarray) -> np.ndarray:
 def bar(name: str, length: float) -> dict:
     """Return a rigid arm in space that weighs nothing."""
     return {"name": name, "rigid": True, "length": length, "mass": 0.0, "inertia": [0.0] * 6}
-
-
-def parallelogram(folder: Path, **tables) -> Scene:
-    """Return four bars on two motors about one axis that carry a payload, controlled.
-
-    Its closure is a pin about z: two of its five equations keep the bars together, those across
-    the plane are redundant.
-    """
-    (folder / "turn.csv").write_text("t,first,second\n0,2.0,0.6\n0.3,1.2,1.0\n")
-    chain = (("first", "ground", "a"), ("elbow", "a", "ab"),
-             ("second", "ground", "b"), ("wrist", "b", "ba"))  # fmt: skip
-    joints = [
-        {"name": name, "type": "revolute", "parent": parent, "child": child, "axis": [0, 0, 1],
-         "passive": name in ("elbow", "wrist")}
-        for name, parent, child in chain
-    ]  # fmt: skip
-    tree = {
-        "material": {"young_modulus": MODULUS, "poisson_ratio": 0.3, "density": DENSITY},
-        "arms": [bar("a", 0.3), bar("ab", 0.4), bar("b", 0.4), bar("ba", 0.3)],
-        "joints": joints,
-        "closures": [{"name": "pin", "kind": "pin", "between": ["ba", "ab"], "axis": [0, 0, 1]}],
-        "motion": {"path": "joints", "file": "turn.csv", "horizon": 0.4, "gravity": [0, 0, -9.81],
-                   "initial_joints": [2.0, -1.4, 0.6, 1.4]},
-        "payload": {"arm": "ab", "mass": 0.5},
-        "control": {"stiffness": [500.0, 400.0], "damping": [5.0, 4.0]},
-    }  # fmt: skip
-    return scene_from_dict(with_keys(tree, tables), str(folder / "parallelogram.toml"))
-
-
-def test_poles_of_a_loop_in_space(tmp_path) -> None:
-    """Two coordinates, in motion: T = m |a e(alpha) + b e(beta)|'^2 / 2; the response is theirs."""
-    limits = {"damping_ratio": 0.1, "poles_at": [0.0, 0.1, 0.2]}
-    result = do.Model(parallelogram(tmp_path, constraints=limits)).simulate()
-    trajectory, ratios = result.trajectory, []
-    m, a, b = 0.5, 0.3, 0.4
-    for t in limits["poles_at"]:
-        motion = trajectory.at(np.array([t])).motion
-        (q, second), (w, v), (wd, vd) = (x[0, [0, 2]] for x in (motion.q, motion.qd, motion.qdd))
-        c, s = np.cos(q - second), np.sin(q - second)
-        M = m * np.array([[a * a, a * b * c], [a * b * c, b * b]])
-        D = np.diag([5.0, 4.0]) + 2.0 * m * a * b * s * np.array([[0.0, v], [-w, 0.0]])
-        turned = m * a * b * np.array([[c * v * v - s * vd], [-c * w * w - s * wd]])
-        exact = of_second_order(M, D, np.diag([500.0, 400.0]) + turned * [1.0, -1.0])
-        found = np.sort_complex(state_space(trajectory, t).poles)
-        assert np.abs(found - exact).max() < 1e-8 * np.abs(exact).max()
-        ratios.append((-exact.real / np.abs(exact)).min())
-    assert result.evaluation.values_of("damping_ratio")[0] == pytest.approx(min(ratios), rel=1e-8)
 
 
 def test_poles_of_a_loop_in_the_plane() -> None:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from robots import DEMO, DEMO_MOTION, frames_of, mechanism_of, run_import, tree_of, write_uneven
+from robots import DEMO, DEMO_MOTION, mechanism_of, run_import, tree_of, write_uneven
 from runs import run
 
 from dolfinopt.arms.arm import build_arms, uniform_design
@@ -26,7 +26,6 @@ from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import read_scene
 
-yourdfpy = pytest.importorskip("yourdfpy")
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 MOVED = 12  # random joint coordinates
@@ -59,28 +58,6 @@ def in_scene(robot, mechanism, q):
     """Return those coordinates in the order of the scene's joints."""
     by_name = {scene_names([joint.name])[joint.name]: q[joint.name] for joint in robot.movable}
     return np.column_stack([by_name[mechanism.joints[i].name] for i in mechanism.movable])
-
-
-def test_the_scene_moves_as_the_robot(imported, rigid):
-    """Frames of all bodies against yourdfpy's, the end-effector's the tool's."""
-    file, (robot, bodies, mechanism) = imported[0], rigid
-    q = random_joints(robot, np.random.default_rng(1))
-    rows = in_scene(robot, mechanism, q)
-    none = np.zeros_like(rows)
-    ends = end_effector(mechanism, RigidMotion(rows, none, none), np.zeros((MOVED, 0)))
-    model = yourdfpy.URDF.load(str(file), load_meshes=False)
-    for k in range(MOVED):
-        own_q = {name: values[k] for name, values in q.items() if name != "other"}
-        if "rail" in own_q:  # whose axis yourdfpy does not make a unit vector
-            own_q["rail"] /= 3.0
-        model.update_cfg(own_q)
-        frames = frames_of(mechanism, rows[k])
-        for body, frame in zip(bodies, frames, strict=True):
-            expected = model.get_transform(body.link)
-            assert np.abs(frame - expected @ body.frame).max() < 1e-12
-        tool = model.get_transform(bodies[-1].link)
-        assert bodies[-1].link in ("tool", "grip")
-        assert np.abs(ends[k] - tool[:3, 3]).max() < 1e-12
 
 
 def test_drive_forces_against_pinocchio(imported, rigid):

@@ -24,7 +24,6 @@ COMM = MPI.COMM_WORLD
 YOUNG, DENSITY, THICKNESS = 70e9, 2700.0, 0.01  # Pa, kg/m3, m; of solids, too
 LENGTH, HEIGHT = 1.0, 0.02  # m
 BENDING, LINE_MASS = YOUNG * THICKNESS * HEIGHT**3 / 12.0, DENSITY * THICKNESS * HEIGHT
-F_X = 12  # place of a unit load in space
 
 
 def uniform(arm: Substructure) -> ElasticArm:
@@ -88,37 +87,6 @@ def test_buckling_loads(beam):
     """
     assert beam.critical(4) == pytest.approx(0.25 * np.pi**2 * BENDING / LENGTH**2, rel=1e-3)
     assert LINE_MASS * beam.critical(0) == pytest.approx(7.837 * BENDING / LENGTH**3, rel=1e-3)
-
-
-@pytest.mark.serial  # ranks: test_ranks of test_elements
-@pytest.mark.parametrize("dim", [2, 3])
-def test_pulled_beam(dim):
-    """K0 of a unit pull in the interface's coordinates: the beam's geometric stiffness matrix.
-
-    1 / L along, 6 / (5 L), -+ 1 / 10, 2 L / 15 of Hermite's cubics (Przemieniecki, Theory of Matrix
-    Structural Analysis (1968), 15.3); I_p / (A L) of torsion (Wagner). The solid's faces stiffen
-    their neighbourhood: with a piece d of 0.1 of the height as rigid as they are 1 / 10 becomes
-    1 / 10 + 6 d / (5 L). In the plane without the rotation of second order of the interface
-    2 L / 15 is off by 1.9 %.
-    """
-    height, thickness = 0.02, 0.01
-    arm, L, load, error = uniform(plane((100, 4), 0.04, 0.33)), LENGTH, 4, 4e-3
-    if dim == 3:
-        arm, L = solid("incompatible", height, thickness, (25, 2, 2)), solids.LENGTH
-        load, error = F_X, 0.035
-    K0 = unit_loads(arm).geometric_stiffness(arm.constraint_modes.field)[load]
-    beam = np.zeros((6, 6))
-    beam[0, 0] = 1.0 / L
-    beam[1, 1] = beam[2, 2] = 6.0 / (5.0 * L)
-    beam[4, 4] = beam[5, 5] = 2.0 * L / 15.0
-    beam[1, 5] = beam[5, 1] = -0.1
-    beam[2, 4] = beam[4, 2] = 0.1
-    beam[3, 3] = (height**2 + thickness**2) / (12.0 * L)
-    if dim == 2:
-        beam = beam[np.ix_([0, 1, 5], [0, 1, 5])]
-    for at in zip(*np.nonzero(beam), strict=True):
-        assert K0[at] == pytest.approx(beam[at], rel=error), at
-    assert np.abs(K0[beam == 0.0]).max() < 1e-6 * np.abs(K0).max()
 
 
 def tangents(arm: ElasticArm) -> Callable[..., np.ndarray]:

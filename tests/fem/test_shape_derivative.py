@@ -10,12 +10,10 @@ from mpi4py import MPI
 from solids import link_mesh, tensors_of
 
 from dolfinopt.fem import forms
-from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
 from dolfinopt.fem.shape_derivative import ShapeDerivative
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.checks import cell_sizes
-from dolfinopt.reduction import by_frame_fields
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
 
@@ -66,14 +64,3 @@ def test_the_same_by_ufl(shape: str, element: str) -> None:
     by_ufl = sum(derivative.run(forms.by_corners, known, forms.stiffness_product))
     found = derivative.stiffness(u, u, young)
     assert np.abs(found - by_ufl.reshape(found.shape)).max() < 1e-12 * np.abs(by_ufl).max()
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_places_by_rigid_motions(dim: int) -> None:
-    """They are linear in the points but for translations, so that products are the same."""
-    X = np.random.default_rng(1).normal(size=(5, dim))
-    by = np.random.default_rng(2).normal(size=rigid_motions(X).shape)
-    turns = rigid_motions(X)[:, :, dim:]
-    assert np.sum(by_rigid_motions(by) * X) == pytest.approx(np.sum(by[:, :, dim:] * turns))
-    order = [1, 2, 0] if dim == 2 else [1, 2, 5, 4, 3, 0]
-    assert by_frame_fields(by[:, :, order]) == pytest.approx(by_rigid_motions(by))

@@ -67,25 +67,6 @@ def radius_error(mesh, facets, x, radius):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_scara_arm_is_tapered_and_its_interfaces_are_its_bores(shape):
-    """No ray of the mesh within a bore's box is an interface, or a ring would be wider there."""
-    taper, bore, passive = 0.75, 0.4, 0.006  # the file's defaults, and its ring here
-    mesh = arm_mesh(COMM, entry(mesh_folder() / "scara_arm.geo", length=0.325, height=0.1,
-                                mesh_size=0.004, cell_shape=shape, passive=passive))  # fmt: skip
-    outer = 0.05, 0.05 * taper
-    for facets, x, radius in zip((mesh.inboard_facets, mesh.outboard_facets), (0.0, 0.325), outer):
-        assert radius_error(mesh, facets, x, bore * radius) < 1e-9
-    # Two sectors and the bar between their tangents, without the bores.
-    lean = np.arcsin((outer[0] - outer[1]) / 0.325)
-    sectors = (0.5 * np.pi - lean) * outer[1] ** 2 + (0.5 * np.pi + lean) * outer[0] ** 2
-    area = sectors + sum(outer) * 0.325 * np.cos(lean) - np.pi * bore**2 * np.square(outer).sum()
-    assert collect(mesh.area).sum() == pytest.approx(area, rel=2e-3)  # arcs in chords
-    solid = collect(mesh.centroid)[collect(mesh.passive)]
-    inboard = np.linalg.norm(solid[solid[:, 0] < 0.16], axis=1)
-    assert inboard.max() < bore * outer[0] + 0.1 / 16.0  # the file's own ring, a little wider
-
-
-@pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(
     ("passive", "ring"), [(0.012, 0.012), pytest.param(0.0, HEIGHT / 8.0, marks=pytest.mark.serial)]
 )

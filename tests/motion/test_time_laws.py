@@ -123,25 +123,6 @@ def test_limits_are_met_exactly(name: str) -> None:
     assert len(binding) == (2 if name == "trapezoidal" else 3)
 
 
-@pytest.mark.parametrize(
-    ("name", "limits", "expected"),
-    [
-        ("trapezoidal", {"speed": 1.0, "acceleration": 2.0}, 2.0 + 0.5),  # D/v + v/a
-        ("trapezoidal", {"speed": 9.0, "acceleration": 2.0}, 2.0),  # 2 sqrt(D/a)
-        ("trapezoidal", {"acceleration": 2.0}, 2.0),
-        ("trapezoidal", {"speed": 1.0}, 2.0 / 0.75),  # D/(v (1 - share))
-        # D/v + v/a + a/j, D/v + 2 sqrt(v/j), cbrt(32 D/j): Biagiotti & Melchiorri 2008, 3.4.
-        ("s-curve", {"speed": 1.0, "acceleration": 2.0, "jerk": 8.0}, 2.0 + 0.5 + 0.25),
-        ("s-curve", {"speed": 1.0, "acceleration": 99.0, "jerk": 4.0}, 2.0 + 1.0),
-        ("s-curve", {"jerk": 32.0}, (32.0 * 2.0 / 32.0) ** (1 / 3)),
-        ("s-curve", {"acceleration": 4.0, "jerk": 16.0}, 0.25 + np.sqrt(0.25**2 + 2.0)),
-    ],
-)
-def test_fastest(name: str, limits: dict[str, float], expected: float) -> None:
-    """Two metres, in closed form."""
-    assert_close(law_of(name, 0.25, 2.0, **limits).least, expected, 1e-14)
-
-
 def posed(**motion: Any) -> Scene:
     """Return the example with another motion."""
     data = read_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()

@@ -197,19 +197,6 @@ def cells_of(axes) -> list[PathCollection]:
     return [each for each in axes.collections if isinstance(each, PathCollection)]
 
 
-@pytest.mark.parametrize("magnification", [1.0, 20.0])
-def test_magnified_arms_join(magnification):
-    views, mechanism = manipulator(3)
-    film = machine.make_film(swinging(mechanism), magnification, 5)
-    for frame in range(5):
-        for k, view in enumerate(views):
-            cells = film.bent.material(view.corners, view.modes, k, frame)
-            for end, place in ((0.0, film.bent.origin), (LENGTHS[k], film.bent.outboard)):
-                axis = np.all(np.abs(view.corners - [end, 0.0]) < 1e-12, axis=-1)
-                assert axis.any()
-                np.testing.assert_allclose(cells[axis] - place[frame, k], 0.0, atol=1e-13)
-
-
 def test_motion_shows_the_payload_where_it_is(tmp_path):
     views, mechanism = manipulator(2)
     moving = swinging(mechanism)

@@ -184,16 +184,6 @@ def test_modes_keep_the_interfaces(shared_arm, method):
     assert np.array_equal(basis.MV, arm.mass_times(basis.V))
 
 
-@pytest.mark.parametrize("method", ["modal", "craig-bampton", "krylov"])
-def test_every_degree_of_freedom(method):
-    """As many coordinates as the arm has: the reduced model is the full one."""
-    arm, own = (with_densities(make_arm((3, 1), comm), graded) for comm in (COMM, SELF))
-    body = shape_integrals(arm, ALL[method](arm, Options(arm.num_dofs)), 0.0)
-    reduced = scipy.linalg.eigvalsh(body.K, body.M)
-    assert arm.num_dofs == 11
-    assert reduced == pytest.approx(scipy.linalg.eigvalsh(*dense(own)), rel=DENSE)
-
-
 def test_too_many_modes_are_an_error_that_says_so():
     with pytest.raises(ConvergenceError, match=r"arm 'arm': only \d+ of 5.*reduction\.coordinates"):
         lowest_eigenpairs(Pencil(with_densities(make_arm((2, 1)), uniform)), 5, None)

@@ -57,17 +57,6 @@ def factor_of(state, load: int, size: float) -> float:
 
 
 @pytest.mark.serial
-def test_bar_buckles_at_eulers_force(bar):
-    """Clamped and free; shear lowers it by F / (k G A), 0.06 %. The next one is far behind."""
-    state, bending = bar
-    euler = np.pi**2 * bending / (4.0 * LENGTH**2)
-    found = buckling_modes(under(state, FORCE, -euler / 10.0), 3)
-    assert 1.0 / found.inverse == pytest.approx([10.0], rel=0.01)
-    assert state.elastic.energy_matrix(found.field) == pytest.approx(np.eye(1), abs=1e-8)
-    assert factor_of(state, FORCE, -euler / 20.0) == pytest.approx(1.0 / (0.5 * found.inverse[0]))
-
-
-@pytest.mark.serial
 def test_bar_under_its_inertia_buckles_at_the_known_acceleration(bar):
     """q L = 7.837 EI / L^2 of a column under its own weight (Greenhill 1881)."""
     state, bending = bar

@@ -71,47 +71,6 @@ def test_scene_is_frozen_hashable_and_picklable():
     assert scene != str(TWO_ARM)
 
 
-@pytest.mark.parametrize(
-    ("paths", "value"),
-    [
-        ("motion.flattening payload.mass design.filter_radius optimizer.max_iterations", 0),
-        ("design.filter_radius", 1.0),  # the longest arm
-        ("arms.0.cells", [MAX_CELLS, 1]),
-        ("arms.0.name", "left arm_2-b"),
-        ("arms.0.name", "2nd"),
-        ("motion.horizon", 1.9),  # no rest behind the motion
-        ("motion", {"path": "line", "start": [0, 0], "law": "septic"}),
-        ("motion", {"path": "arc", "base": -1.0}),
-        ("objective.load_cases", 3000),  # 3 s hold 3000 samples, whatever 3.0/1e-3 rounds to
-        ("reduction.coordinates", 3),
-        ("reduction.coordinates", 5177),  # 2 * 199 * 13 + 3
-        ("reduction", {"method": "modal", "coordinates": 1}),
-        ("reduction", {"coordinates": "auto", "tolerance": 1e-6}),
-        ("reduction", {"method": "krylov", "frequencies": [0.0, 9, 25.5, 80.0], "coordinates": 12}),
-        ("reduction", {"method": "balanced", "frequencies": [5, 80.0]}),
-        ("arms", [ARM]),  # one arm, on a cart or by a table on a fixed base
-        ("", {"arms": [ARM], "motion": {**JOINTS, "base": "fixed"}}),
-        ("", {"simulation": {"sample": 3.0}, "objective": {"load_cases": 1}}),
-        ("", {"objective": {"kind": "static", "gradient": "exact"},
-              "constraints": {"deviation": 0.01},
-              "scenarios": [{"changes": ["payload.mass=4"]}]}),  # of a limit alone
-        ("design", {"minimum": 0.3, "volume_fraction": 0.3}),
-    ],
-)  # fmt: skip
-def test_borders_of_the_ranges_are_allowed(paths, value):
-    for data in [changed(path, value) for path in paths.split()] or [minimal(**value)]:
-        assert isinstance(scene_from_dict(data, overrides=["arms.passive=0"]), Scene)
-
-
-def test_reducible_dofs():
-    # 3 x 2 cells: 2 columns of interior nodes with 3 nodes of 2 dofs, and the outboard interface.
-    assert Arm(**ARM, cells=(3, 2)).n_reducible == 2 * 3 * 2 + 3
-    assert Arm(**ARM, cells=(1, 9)).n_reducible == 3
-    assert Arm(**ARM, cells=(3, 2), element="incompatible").n_reducible == 2 * 3 * 2 + 3
-    # Nodes halfway, too: 5 columns of 5.
-    assert Arm(**ARM, cells=(3, 2), element="quadratic").n_reducible == 2 * 5 * 5 + 3
-
-
 def test_ends_are_solid_unless_the_scene_says_otherwise():
     for keys, length in (
         ({}, 0.015),  # a quarter of the height

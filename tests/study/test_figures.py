@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 from pictures import TOLERANCE, difference
 
-from dolfinopt.study.figures import draw, line_figure
-from dolfinopt.study.tables import FrameFigure, Line, LineFigure, Panel, Table
+from dolfinopt.plots.style import look, look_numbers, spread
+from dolfinopt.study.figures import line_figure
+from dolfinopt.study.tables import Line, LineFigure, Panel, Table
 
 PICTURE = Path(__file__).parent / "sweep.png"  # written by `bare`, then looked at
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -34,17 +35,6 @@ def test_line_figure():
     (axes,) = line_figure(LineFigure("", "", (memory,))).axes
     assert axes.get_xscale() == axes.get_yscale() == "log"
     assert 10.0 < axes.get_ylim()[0] < 100.0 and 400.0 < axes.get_ylim()[1] < 1000.0
-
-
-@pytest.mark.parametrize("factor", [0.1, 1.0, 100.0])
-def test_losses_have_one_scale(factor):
-    values = factor * np.array([[0.0, 1.5], [-2.0, 0.0]])
-    frame = pd.DataFrame(values, columns=["used at 4", "used at 8"]).assign(panel="loss [%]")
-    frame.insert(0, "made for [kg]", ["4", "8"])
-    axes = draw(FrameFigure("", "T", "matrix", frame)).axes[0]
-    assert axes.images[0].get_clim() == (-10.0, 10.0)
-    assert [text.get_text() for text in axes.texts] == [f"{value:.2f}" for value in values.flat]
-    assert (axes.get_ylabel(), axes.get_xlabel()) == ("made for [kg]", "used at [kg]")
 
 
 def sweep_figure(factor=1.0):
@@ -87,3 +77,13 @@ def test_a_table_and_curves_as_text():
                     ["p", "a", "2", "4"], ["p", "b", "1", "3"], ["p", "b", "2", ""]]  # fmt: skip
     both = LineFigure("", "", panels).csv()
     assert both.splitlines()[0] == "panel,line,x,y" and len(both.splitlines()) == 7
+
+
+def test_looks_of_a_crowd():
+    """28 before one comes twice; a figure's own differ up to the seventh; names do not overlap."""
+    numbers = look_numbers([list("abcdefg"), [f"n{k}" for k in range(19)]])
+    assert len(set(numbers.values())) == 26
+    assert len({look(numbers[name])["color"] for name in "abcdefg"}) == 7
+    assert len(look_numbers([[f"n{k}" for k in range(60)]])) == 60
+    np.testing.assert_allclose(spread([0.5, 0.5, 0.9], 0.1), [0.5, 0.6, 0.9])
+    np.testing.assert_allclose(spread([1.0, 0.99], 0.1), [1.0, 0.9])
