@@ -1,7 +1,5 @@
 """Hollow arms: stiffness against theory of thin walls, gradients by Taylor tests, any ranks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -20,7 +18,7 @@ G = 0.5 * YOUNG / (1.0 + POISSON)
 LOADS = np.eye(6)[[1, 2, 0, 3]]
 
 
-def tube(size: tuple[float, float, float]) -> np.ndarray:
+def tube(size):
     """Return the same of a round tube; shear by Cowper, doi:10.1115/1.3625046."""
     L, d, _ = size
     t = d / 40.0
@@ -67,7 +65,7 @@ def test_gradients_by_the_wall(changes):
     found += [row.cells for row in constraint_gradients(*built.place, trajectory, built.profile)]
     slopes = [sum(float(row[k] @ along[k]) for k in row) for row in found]
 
-    def values(h: float) -> np.ndarray:
+    def values(h):
         one, _ = built.evaluate({k: x[k] + h * along[k] for k in x})
         smooth = (1.0 + np.array(one.constraints)) * np.array(one.smooth_limits) / held
         return np.append(one.objective, smooth)

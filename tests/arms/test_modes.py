@@ -1,7 +1,5 @@
 """Modes with what an arm carries: dense solves, beams in closed form, crossings, gradients."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,23 +7,22 @@ import pytest
 import scipy.linalg
 from bodies import changed, random_chain, random_tree
 from mpi4py import MPI
-from remainders import Field, arm_of, dense_matrices, wave
+from remainders import arm_of, dense_matrices, wave
 
-from dolfinopt.arms.arm import Arm
-from dolfinopt.arms.modes import FrozenTree, LoadedModes, loaded_modes
+from dolfinopt.arms.modes import FrozenTree, loaded_modes
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.responses.frequency import Eigenfrequency
 
 
-def design_of(arm: Arm, field: Field = wave) -> np.ndarray:
+def design_of(arm, field=wave):
     """Return the field on the arm's cells."""
     return field(0, *(arm.mesh.centroid.T / arm.mesh.outboard_point[0]))
 
 
 @pytest.mark.serial
 @pytest.mark.parametrize("d", [2, 3])
-def test_carried_inertia_of_a_frozen_machine(d: int) -> None:
+def test_carried_inertia_of_a_frozen_machine(d):
     """What body 1 carries is what its rows feel of the others, which are held."""
     rng = np.random.default_rng(7)
     machine = random_tree(rng, interfaces=2) if d == 3 else random_chain(rng, 3)
@@ -60,7 +57,7 @@ def test_carried_inertia_of_a_frozen_machine(d: int) -> None:
             assert found == pytest.approx(np.sum(weights * (after - before)), rel=1e-9, abs=1e-12)
 
 
-def carried_by(mass: float, x: float, y: float, inertia: float) -> np.ndarray:
+def carried_by(mass, x, y, inertia):
     """Return the inertia (3, 3) of a body with its centre at (x, y), about the origin."""
     cx, cy = mass * x, mass * y
     inertia += mass * (x * x + y * y)
@@ -75,7 +72,7 @@ NOTHING, BODY = np.zeros((3, 3)), carried_by(3.0, 0.4, -0.8 / 3.0, 0.8)
     [NOTHING, carried_by(6.0, 0.0, 0.0, 0.0), BODY],
     ids=["nothing", "point", "body"],
 )
-def test_dense_eigenproblem(carried: np.ndarray) -> None:
+def test_dense_eigenproblem(carried):
     """Any design on a small mesh; unit modal mass, carried mass included."""
     arm = arm_of((9, 3), "arms.height=0.2")
     arm.state(design_of(arm))
@@ -95,7 +92,7 @@ def test_dense_eigenproblem(carried: np.ndarray) -> None:
     np.testing.assert_allclose(mass, np.eye(5), atol=1e-9)
 
 
-def test_an_arm_cut_in_two() -> None:
+def test_an_arm_cut_in_two():
     """The same on the ranks that share an arm, also of solids that float."""
     values, floating = [], []
     for comm in (MPI.COMM_SELF, MPI.COMM_WORLD):
@@ -115,28 +112,28 @@ STUBBY = ("arms.length=0.3", "arms.height=0.9")
 MASS = 20.0  # kg
 
 
-def symmetric(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def symmetric(k, x, y):
     """Return a design symmetric about the axis, whose axial and bending modes do not mix."""
     return 0.5 + 0.2 * np.cos(3.0 * x) * np.cos(2.0 * y)
 
 
-def stubby() -> Arm:
+def stubby():
     """Return an arm three times as high as long, of the symmetric design."""
     arm = arm_of((8, 8), *STUBBY)
     arm.state(design_of(arm, symmetric))
     return arm
 
 
-def squared_period(modes: LoadedModes, exponent: float, follow: bool) -> tuple[float, np.ndarray]:
+def squared_period(modes, exponent, follow):
     options = SimpleNamespace(exponent=exponent, follow=follow)
     return Eigenfrequency(options).squared_period(modes)
 
 
-def test_following_a_mode_through_a_crossing() -> None:
+def test_following_a_mode_through_a_crossing():
     """Rotary inertia lowers bending below the axial mode, which it does not touch: MAC keeps it."""
     arm, seen = stubby(), []
 
-    def carried(inertia: float) -> np.ndarray:
+    def carried(inertia):
         return carried_by(MASS, -0.15, 0.0, inertia)
 
     first = loaded_modes(arm.elastic, carried(0.5), 3, None)

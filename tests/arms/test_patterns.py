@@ -1,7 +1,5 @@
 """Designs of arms: their state, and arms that repeat another's design, scaled."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -166,13 +164,13 @@ def test_an_arm_takes_from_its_pattern_not_from_the_arm_before():
 # -- states of one arm: computed once, unmoved by later ones  -------------------------------------
 
 
-def small_arm() -> Arm:
+def small_arm():
     scene = do.load_scene(TWO_ARM, ["arms.cells=[16,3]"])
     return Arm(scene, 0, MPI.COMM_SELF, do.Profile())
 
 
 @pytest.mark.serial
-def test_a_state_is_computed_once_and_lasts() -> None:
+def test_a_state_is_computed_once_and_lasts():
     arm = small_arm()
     counts = arm.profile.counts
     x, other = arm.uniform(0.5), arm.uniform(0.7)
@@ -199,7 +197,7 @@ def test_a_state_is_computed_once_and_lasts() -> None:
 
 
 @pytest.mark.serial
-def test_an_arm_without_a_design_says_so() -> None:
+def test_an_arm_without_a_design_says_so():
     arm = small_arm()
     assert arm.basis is None
     with pytest.raises(RuntimeError, match=r"no design yet: call state"):

@@ -1,9 +1,5 @@
 """Solid arms: their bodies against closed forms, gradients by Taylor tests, averages of designs."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -22,7 +18,7 @@ COMM = MPI.COMM_WORLD
 MASS = DENSITY * LENGTH * HEIGHT * THICKNESS
 
 
-def rough(arm: Arm) -> np.ndarray:
+def rough(arm):
     """Return densities without symmetry, by place."""
     x, y, z = arm.mesh.centroid.T
     return 0.6 + 0.3 * np.sin(70.0 * x + 160.0 * y + 210.0 * z)
@@ -67,16 +63,13 @@ def test_a_design_file_of_a_solid_is_read_by_place(tmp_path):
         read_design(path, partition, {0: arm})
 
 
-def response(weights: ShapeIntegrals) -> Callable[[ShapeIntegrals], float]:
+def response(weights):
     """Return the weighted sum of a body's integrals."""
     pairs = [(one.name, getattr(weights, one.name)) for one in TABLE]
     return lambda body: sum(float(np.sum(by * getattr(body, name))) for name, by in pairs)
 
 
-Function = Callable[[ShapeIntegrals], float]
-
-
-def remainders(arm: Arm, function: Function, by: ShapeIntegrals) -> np.ndarray:
+def remainders(arm, function, by):
     """Return rates at which the remainder of first order falls on halved steps."""
     comm, x = arm.mesh.comm, arm.mesh.keep(rough(arm))
     along = np.where(arm.mesh.fixed, 0.0, np.cos(90.0 * arm.mesh.centroid @ [1.0, 2.0, -3.0]))
@@ -141,7 +134,7 @@ def test_gradient_of_a_body(cells, stiffening, interfaces):
 def test_ranks_agree():
     """One arm on all ranks and on one: body and gradient by place, to 1e-8."""
 
-    def found(comm: MPI.Comm) -> tuple[ShapeIntegrals, np.ndarray]:
+    def found(comm):
         arm = solid_arm(comm, cells=(8, 3, 2), stiffening=True, filter_radius=0.02)
         state = arm.state(arm.physical(rough(arm)))
         gradient = arm.backward(exact_gradient(state, state.body))

@@ -81,7 +81,7 @@ def test_slopes_are_the_derivatives(law, penalty):
 # -- in a scene ------------------------------------------------------------------------------
 
 
-def test_local_modes_of_a_frame_with_void(shared_tmp_path) -> None:
+def test_local_modes_of_a_frame_with_void(shared_tmp_path):
     """Classic SIMP's lowest modes live in the windows; the other laws' are the frame's."""
     spectra = demo("demo_localised_modes").main(shared_tmp_path, (40, 6), (1e-3, 1e-2, 0.0))
     if MPI.COMM_WORLD.rank > 0:

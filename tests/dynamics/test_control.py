@@ -1,12 +1,9 @@
 """Machines under control: against geometrically exact beams, energy, stiff limits, soft joints."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from machines import (
     GAINS,
-    Tree,
     apart,
     machine,
     reference,
@@ -17,7 +14,6 @@ from machines import (
 from machines import small_two_arm as small
 from runs import TWO_ARM, overrides, run
 
-from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.drives import saturated
 from dolfinopt.dynamics.measured import LINEAR_DRIVE_SHARE
 from dolfinopt.dynamics.system import relative_error
@@ -31,7 +27,7 @@ SOFT = {"joint_stiffness": 1e5, "joint_damping": 100.0}
 ROTORS = {"rotor_inertia": 2e-5, "gear_ratio": 100.0}
 
 
-def test_deviation_and_forces_of_exact_beams() -> None:
+def test_deviation_and_forces_of_exact_beams():
     """Exudyn's beams with the same controller, and a second code: `reference/README.md`."""
     tree = two_arm("arms.cells=[100,6]", "reduction.coordinates=6", control=GAINS)
     simulation = {"stiffening": True, "sample": 1e-2, "tolerance": 1e-5}
@@ -54,7 +50,7 @@ def test_deviation_and_forces_of_exact_beams() -> None:
 
 
 @pytest.mark.parametrize(("stiffening", "least", "most"), [(True, 0.0, 4e-3), (False, 1e-2, 3e-2)])
-def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: float) -> None:
+def test_prescribed_arms_of_exact_beams(stiffening, least, most):
     """Fast arms with 0.5 kg: linear they are 2.0 % off, stiffened 0.39 %; `reference/README.md`."""
     expected = reference("two_arm_half_T0.9_0.5kg")
     motion = {"duration": 0.9, "horizon": float(expected["t"][-1])}
@@ -69,21 +65,21 @@ def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: fl
     assert least < off < most
 
 
-def arms(stiffening: bool, **changes: object) -> Tree:
+def arms(stiffening, **changes):
     """Return the machine with motors at its joints under gravity, without control unless told."""
     simulation = {"stiffening": stiffening, "tolerance": 1e-6}
     tree = small({"joint_mass": 0.5, "joint_inertia": 0.01}, motion=EARTH, simulation=simulation)
     return {**tree, "control": None, **changes}
 
 
-def test_friction_while_a_joint_turns_round() -> None:
+def test_friction_while_a_joint_turns_round():
     """Feed-forward's jump and friction's leave a pulse of 0.3 ms, which steps must not miss.
 
     Unless a step ends there the error was twelve times the tolerance, the estimate 0.4 times.
     """
     friction = {"friction": [0.0, 5.0], "friction_speed": 1e-3}
 
-    def solved(tolerance: float) -> Trajectory:
+    def solved(tolerance):
         found = simulated(small(friction, control=GAINS, simulation={"tolerance": tolerance}))
         assert found.trajectory is not None
         return found.trajectory
@@ -95,7 +91,7 @@ def test_friction_while_a_joint_turns_round() -> None:
     assert error < 1e-5  # 2e-7
 
 
-def test_angles_of_motors_are_written(tmp_path) -> None:
+def test_angles_of_motors_are_written(tmp_path):
     """At rest under gravity the drives give what the springs between motor and arm give."""
     gains = "control={stiffness=[2e5, 2e4, 2e4], damping=[2e4, 600.0, 600.0]}"
     joints = (f"arms.{key}={value}" for key, value in (SOFT | ROTORS).items())
@@ -109,7 +105,7 @@ def test_angles_of_motors_are_written(tmp_path) -> None:
     assert "q_motor_arm1,q_motor_arm2" in header
 
 
-def test_saturation_is_linear_to_95_percent_and_smooth() -> None:
+def test_saturation_is_linear_to_95_percent_and_smooth():
     """As wanted within the limit, the limit beyond; derivative right, continuous to the second."""
     limit = np.array([40.0])
     within = limit * np.array([[-LINEAR_DRIVE_SHARE], [0.0], [0.3], [LINEAR_DRIVE_SHARE]])
@@ -128,7 +124,7 @@ def test_saturation_is_linear_to_95_percent_and_smooth() -> None:
     assert np.abs(np.diff(bend, axis=0)).max() < 60.0 * h / 4.0**2
 
 
-def lifting(mass: float, limits: list[float] | None) -> Tree:
+def lifting(mass, limits):
     """Return a robot of two links that lifts its payload, its drives as its data sheet has them."""
     bar = {"height": 0.1, "thickness": 0.02, "cells": [16, 3], "passive": 0.0}
     gains = {"stiffness": [2e4, 1e4], "damping": [600.0, 200.0]}
@@ -142,7 +138,7 @@ def lifting(mass: float, limits: list[float] | None) -> Tree:
     return with_keys(robot, {"motion": motion, "payload": {"mass": mass}})
 
 
-def test_robot_within_its_data_sheet() -> None:
+def test_robot_within_its_data_sheet():
     """Drives that need less than 95 % of their limits do as drives without; others are cut off."""
     limits = [330.0, 150.0]  # N m
     free, held = (machine(simulated(lifting(18.0, one)))[0] for one in (None, limits))

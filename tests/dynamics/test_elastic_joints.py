@@ -1,13 +1,8 @@
 """Bearings, gears, motors and friction in joints: against another program, energy, limits."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from machines import (
-    Tree,
     check_energy,
     fork,
     machine,
@@ -40,7 +35,7 @@ SPRINGS = {
 }
 
 
-def robot(kind: str, folder) -> Tree:
+def robot(kind, folder):
     """Return the two links of `benchmarks/reference`, their motors alone controlled."""
     parts = [
         gear | {"bearing_stiffness": k, "bearing_damping": [1e-4 * x for x in k]}
@@ -49,7 +44,7 @@ def robot(kind: str, folder) -> Tree:
     bar, file = {"height": 0.05, "thickness": 0.04}, folder / "table.csv"
     upper = {"name": "upper", "rigid": True, "length": 0.5, "mass": 3.0, **bar}
     fore = {"name": "fore", "length": 0.4, "passive": 0.0, **bar}
-    tree: Tree = {
+    tree = {
         "name": kind,
         "material": {"young_modulus": 7e14, "poisson_ratio": 0.33, "density": 2700.0},
         "payload": {"mass": 2.0},
@@ -78,7 +73,7 @@ def robot(kind: str, folder) -> Tree:
 
 
 @pytest.mark.parametrize(("kind", "most"), [("plane", 5e-6), ("space", 4e-4)])
-def test_elastic_joints_of_another_program(kind, most, tmp_path) -> None:
+def test_elastic_joints_of_another_program(kind, most, tmp_path):
     """Exudyn's kinematic trees, see `reference/README.md`."""
     expected, found = reference(f"elastic_joints_{kind}"), machine(simulated(robot(kind, tmp_path)))
     trajectory = found[0]
@@ -95,12 +90,12 @@ def test_elastic_joints_of_another_program(kind, most, tmp_path) -> None:
     assert np.abs(angles - wanted).max() < most * away  # 1e-6, 9e-5
 
 
-def small(joints: Tree, **changes: Any) -> Tree:
+def small(joints, **changes):
     """Return the controlled machine under gravity."""
     return small_two_arm(joints, **{"motion": EARTH, **changes})
 
 
-def forked(tmp_path, parts: Tree, **changes: Any) -> Tree:
+def forked(tmp_path, parts, **changes):
     """Return the fork in space with parts of its two joints that move, one of them prismatic."""
     (tmp_path / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,1,0.1\n")
     tree = fork() | {"name": "fork"}
@@ -130,18 +125,18 @@ SCENES = {
 
 
 @pytest.mark.parametrize("kind", SCENES)
-def test_work_is_energy(kind, tmp_path) -> None:
+def test_work_is_energy(kind, tmp_path):
     """Drive work = kinetic + strain + potential energy + what dampers and friction took."""
     check_energy(simulated(SCENES[kind](tmp_path)), 1e-7)  # measured 3e-10 at most
 
 
-def test_inf_is_rigid_as_zero_is() -> None:
+def test_inf_is_rigid_as_zero_is():
     """JSON does not know it: scenes keep 0."""
     given = scene_from_dict(small({"bearing_stiffness": [1e6, np.inf, np.inf, 0.0, 0.0, 5e4]}))
     assert given.arms[0].bearing_stiffness == (1e6, 0.0, 0.0, 0.0, 0.0, 5e4)
 
 
-def test_friction_of_prescribed_joints_is_the_drives() -> None:
+def test_friction_of_prescribed_joints_is_the_drives():
     """The motion keeps its bits; forces grow by f_v v + f_c tanh(v / v_s)."""
     free, rubbed = (
         simulated(small(parts) | {"control": None}).trajectory
@@ -155,7 +150,7 @@ def test_friction_of_prescribed_joints_is_the_drives() -> None:
     np.testing.assert_allclose(change, expected, rtol=0, atol=1e-12 * size)
 
 
-def test_bearings_stand_in_files(tmp_path) -> None:
+def test_bearings_stand_in_files(tmp_path):
     """Their coordinates have columns and units of their own; compliance is the arms'."""
     from dolfinopt.output.trajectory import trajectory_units, write_trajectory
 
@@ -178,7 +173,7 @@ def test_bearings_stand_in_files(tmp_path) -> None:
     assert found["compliance"].shape[1] == 2
 
 
-def frequencies(tree: Tree, elbow: float, folder) -> np.ndarray:
+def frequencies(tree, elbow, folder):
     """Return the frequencies of two links at rest, the second turned by `elbow` degrees, Hz."""
     angle, file = np.deg2rad(elbow), folder / "still.csv"
     file.write_text(f"t,upper,fore\n0,0,{angle}\n0.2,0,{angle}\n")
@@ -207,7 +202,7 @@ TWO_LINKS = {
 
 
 @pytest.mark.parametrize(("slenderness", "elbow"), TWO_LINKS)
-def test_frequencies_of_two_links_with_lumped_masses(slenderness, elbow, tmp_path) -> None:
+def test_frequencies_of_two_links_with_lumped_masses(slenderness, elbow, tmp_path):
     """Against published ones, with the masses and sections that belong to them."""
     # Those are known from its Euler-Bernoulli columns, seven numbers by least squares from 96
     # frequencies, which a frame of beams then meets to 2e-4.

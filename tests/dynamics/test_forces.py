@@ -1,22 +1,19 @@
 """Forces on interfaces, [[forces]]: closed forms, energy, control, batches."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from machines import fork, trajectory_of, two_arm, with_keys
 
-from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial
 ANGLE = 0.7  # rad, at which the arm is held
 LENGTH, HEIGHT, THICKNESS, MODULUS = 1.0, 0.02, 0.01, 70e9
 
 
-def held(folder: Path, *forces: dict, **changes) -> Scene:
+def held(folder, *forces, **changes):
     """Return one arm of solid material that its joint holds at `ANGLE`."""
     (folder / "held.csv").write_text(f"t,arm\n0,{ANGLE}\n0.1,{ANGLE}\n")
     tree = {
@@ -37,7 +34,7 @@ def held(folder: Path, *forces: dict, **changes) -> Scene:
     ("force", "moment", "frame"),
     [((0.0, 2.0), 0.0, "arm"), ((0.0, 0.0), 1.5, "world"), ((0.0, -3.0), 1.0, "world")],
 )
-def test_cantilever_bends_by_the_closed_form(force, moment, frame, tmp_path) -> None:
+def test_cantilever_bends_by_the_closed_form(force, moment, frame, tmp_path):
     """Tip and joint of Timoshenko's beam, F L^3 / 3 E I + F L / k G A + M L^2 / 2 E I."""
     one = held(tmp_path, {"arm": "arm", "force": force, "moment": moment, "frame": frame})
     found = trajectory_of(one)
@@ -54,7 +51,7 @@ def test_cantilever_bends_by_the_closed_form(force, moment, frame, tmp_path) -> 
     assert found.joint_forces[0, 1] == pytest.approx(torque, rel=1e-9)
 
 
-def test_force_along_the_arm_stiffens_it(tmp_path) -> None:
+def test_force_along_the_arm_stiffens_it(tmp_path):
     """Pulled by P, a cantilever bends by F / P (L - tanh(kL) / k), k^2 = P / EI."""
     # Timoshenko & Gere, Theory of Elastic Stability (1961), sec. 1.11.
     pull, across = 400.0, 1.0
@@ -70,7 +67,7 @@ def test_force_along_the_arm_stiffens_it(tmp_path) -> None:
     assert tip.imag == pytest.approx(exact, rel=1e-3)
 
 
-def test_feed_forward_knows_forces_unless_they_are_disturbances(tmp_path) -> None:
+def test_feed_forward_knows_forces_unless_they_are_disturbances(tmp_path):
     """A moment that the control foresees leaves no error at the start, another one M / k."""
     push = {"arm": "arm2", "moment": 20.0}
     quick = ("arms.cells=[8,2]", "motion.horizon=2.0")
@@ -87,7 +84,7 @@ def test_feed_forward_knows_forces_unless_they_are_disturbances(tmp_path) -> Non
             assert error == pytest.approx([20.0 / 2e4, 20.0 / 2e4], rel=1e-9)
 
 
-def test_link_between_pin_and_cylinder_bears_its_force(tmp_path) -> None:
+def test_link_between_pin_and_cylinder_bears_its_force(tmp_path):
     """The joint of a link that its second interface pushes, in space, by the rigid lever."""
     (tmp_path / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,0,0\n")
     tree = with_keys(fork(), {"motion": {"gravity": [0.0, 0.0, 0.0]}})

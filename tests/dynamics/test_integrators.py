@@ -1,11 +1,7 @@
 """The integrator against closed forms, itself with more stages, and its own estimate."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,44 +17,40 @@ from remainders import build
 from dolfinopt.dynamics import adjoint, march, measured, newton, newton_matrix, radau
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (
-    Solution,
-    Stages,
     Strategy,
 )
 from dolfinopt.dynamics.estimate import Estimate
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.newton import Iterate
-from dolfinopt.dynamics.newton_matrix import NewtonMatrix, factorise, matrix_of
+from dolfinopt.dynamics.newton_matrix import factorise, matrix_of
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.laws import Limits, law_for
 
 pytestmark = pytest.mark.serial  # arrays of one process
 
-Motion = Callable[[np.ndarray], RigidMotion]
 QUINTIC = law_for("quintic", 1.0, Limits(), 0.25)
 HOMES = np.array([0.0, 0.6, 0.8, -0.5])  # m, rad: where the motions begin
 ENDS = (0.0, 0.6, 1.0)  # s, of `reach`
 
 
-def swing(t: np.ndarray, size: tuple[float, ...] = (0.1, 0.5, -0.4)) -> RigidMotion:
+def swing(t, size=(0.1, 0.5, -0.4)):
     """Return harmonic motions that start without speed, smooth for ever."""
     w = np.array([3.0, 4.0, 5.0])  # rad/s
     s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
     return RigidMotion(HOMES[:3] + size * (1.0 - c), size * w * s, size * w**2 * c)
 
 
-def still(t: np.ndarray) -> RigidMotion:
+def still(t):
     """Return no motion."""
     return swing(t, (0.0, 0.0, 0.0))
 
 
-def reach(t: np.ndarray, size: tuple[float, ...] = (0.2, 1.0, -0.8)) -> RigidMotion:
+def reach(t, size=(0.2, 1.0, -0.8)):
     """Return a quintic motion of that size over 0.6 s, then rest."""
     s, sd, sdd = QUINTIC(t, ENDS[1])
     home = np.resize(HOMES, len(size))
@@ -66,32 +58,32 @@ def reach(t: np.ndarray, size: tuple[float, ...] = (0.2, 1.0, -0.8)) -> RigidMot
 
 
 def two_arms(
-    motion: Motion = reach,
-    breakpoints: tuple[float, ...] = ENDS,
-    payload: float = 1.0,
-    bending: float = 10.0,
-    axial: float = 300.0,
-    damping: float = 1e-3,
-    arms: int = 2,
-) -> MachineSystem:
+    motion=reach,
+    breakpoints=ENDS,
+    payload=1.0,
+    bending=10.0,
+    axial=300.0,
+    damping=1e-3,
+    arms=2,
+):
     """Return slender arms of 1 to 50 Hz."""
     arm = beam(bending=bending, axial=axial, damping=damping).body()
     mechanism = plane_chain([arm] * arms, payload, 0.01, (0.0, 0.0), 0.0)
     return MachineSystem(mechanism, motion, breakpoints)
 
 
-def solve(problem: MachineSystem, tolerance: float, stages: int = 3) -> Solution:
+def solve(problem, tolerance, stages=3):
     """Integrate from cold."""
     return radau.integrate(problem, tolerance, stages, Profile())
 
 
 def fitted_order(
-    problem: MachineSystem,
-    on_grid: Callable[[np.ndarray], Solution],
-    counts: tuple[int, int],
-    reference: Solution,
-    rate: int = 0,
-) -> float:
+    problem,
+    on_grid,
+    counts,
+    reference,
+    rate=0,
+):
     """Return log(error ratio) / log(ratio of the steps) at instants of both grids."""
     t = np.linspace(0.0, 0.5, 11)[1:]
     exact = reference.sample(t, rate)
@@ -100,13 +92,13 @@ def fitted_order(
     return float(np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0]))
 
 
-def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
+def profile(name):
     """Return a motion over half a second by a drive's profile, and where its phases end."""
     if name == "smooth":
         return swing, (0.0, 0.5)
     law, size = law_for(name, 1.0, Limits(), 0.4), np.array([0.1, 0.5, -0.4])
 
-    def motion(t: np.ndarray) -> RigidMotion:
+    def motion(t):
         s, sd, sdd = law(t, 0.5)
         return RigidMotion(HOMES[:3] + np.outer(s, size), np.outer(sd, size), np.outer(sdd, size))
 
@@ -122,7 +114,7 @@ def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
         ("s-curve", 3, (40, 160)),
     ],
 )
-def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None:
+def test_order_of_radau(name, stages, counts):
     """2 s - 1 at the steps' ends; jumps of acceleration and jerk there, and only there, keep it."""
     problem = two_arms(*profile(name), axial=100.0, damping=2e-3)
     # One stage more on the finest steps: far below the errors that are measured, 1e-9 at the least.
@@ -134,7 +126,7 @@ def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
-def test_tolerance_is_met(damping: float) -> None:
+def test_tolerance_is_met(damping):
     """The true error is below it, and the estimate is near the true error."""
     problem = two_arms(damping=damping)
     reference = radau.integrate(problem, 1e-10, 5, Profile())
@@ -146,7 +138,7 @@ def test_tolerance_is_met(damping: float) -> None:
         assert 0.5 <= solution.error / true <= 1.6
 
 
-def test_relative_error_is_of_the_worst_arm() -> None:
+def test_relative_error_is_of_the_worst_arm():
     """sqrt(q'Kq), largest in time; an arm at rest is measured against a thousandth of the other."""
     problem = two_arms()
     mechanism = problem.mechanism
@@ -162,13 +154,13 @@ def test_relative_error_is_of_the_worst_arm() -> None:
     assert nothing == pytest.approx(0.2 * np.sqrt(K), rel=1e-14)
 
 
-def soft_arms() -> MachineSystem:
+def soft_arms():
     """Return arms spun up to where centrifugal forces beat the stiffness."""
     spun = lambda t: reach(t, (0.0, 300.0, 0.0))  # noqa: E731
     return two_arms(spun, (0.0, 0.6), bending=1e-2, axial=1.0)
 
 
-def folded_arms() -> MachineSystem:
+def folded_arms():
     """Return arms that the first acceleration alone would fold."""
     return two_arms(swing, (0.0, 1.0), payload=2.0, bending=1e-4, axial=1e-2)
 
@@ -189,18 +181,18 @@ def test_what_cannot_be_solved_is_a_named_error(problem, tolerance, stages, word
     assert "\n" not in str(raised.value)
 
 
-def failing(*_: object) -> Iterate:
+def failing(*_):
     """Newton's method that never converges."""
     return Iterate(np.zeros((1, 3, 6)), False, 1)
 
 
-def test_march_finds_the_same_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_march_finds_the_same_motion(monkeypatch):
     """Where Newton's method fails over the horizon, and it is said so."""
     problem = two_arms()
     plain, over_horizon = solve(problem, 1e-5), radau.newton_in_chunks
-    grids: list[int] = []
+    grids = []
 
-    def fails_at_first(stages: Stages, *others: Any) -> Iterate:
+    def fails_at_first(stages, *others):
         grids.append(len(stages.h))
         return failing() if len(grids) == 1 else over_horizon(stages, *others)
 
@@ -210,7 +202,7 @@ def test_march_finds_the_same_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     assert distance(problem, marched, plain) <= 1e-5 and len(grids) <= 4
 
 
-def test_newton_that_fails_everywhere_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_newton_that_fails_everywhere_is_a_named_error(monkeypatch):
     """Over the horizon and in windows of any length."""
     monkeypatch.setattr(radau, "newton_in_chunks", failing)
     monkeypatch.setattr(march, "newton", failing)
@@ -221,11 +213,11 @@ def test_newton_that_fails_everywhere_is_a_named_error(monkeypatch: pytest.Monke
 @pytest.mark.parametrize(
     ("error", "words"), [(2e-4, r"error of 0\.0002.*tolerance"), (9.0, "still changes")]
 )
-def test_error_that_no_steps_lower(monkeypatch, error: float, words: str) -> None:
+def test_error_that_no_steps_lower(monkeypatch, error, words):
     """Estimates that stay end after a few grids, in one line, not with the memory."""
-    grids: list[int] = []
+    grids = []
 
-    def constant(_: object, time_grid: np.ndarray, *others: object) -> Estimate:
+    def constant(_, time_grid, *others):
         grids.append(len(time_grid) - 1)
         return Estimate(error, np.full(len(time_grid) - 1, error), np.ones(2))
 
@@ -237,7 +229,7 @@ def test_error_that_no_steps_lower(monkeypatch, error: float, words: str) -> Non
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
-def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, share: float) -> None:
+def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, share):
     """Where finer steps have no room, an error between the aim and the tolerance is accepted."""
     honest = radau.estimate
     monkeypatch.setattr(radau, "estimate", lambda *of: replace(honest(*of), error=share * 1e-4))
@@ -251,19 +243,19 @@ def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, share: float) -
             solve(problem, 1e-4)
 
 
-def test_patience_that_ends_is_not_tried_again() -> None:
+def test_patience_that_ends_is_not_tried_again():
     """Work beyond what is counted ends a simulation: no finer grid, no march."""
     with counted(10.0), pytest.raises(ConvergenceError, match="more than 10 Newton iterations"):
         solve(two_arms(), 1e-4)
 
 
-def arms_of_a_scene(*changes: str, cells: tuple[int, int] = (20, 2)) -> Any:
+def arms_of_a_scene(*changes, cells=(20, 2)):
     """Return the trajectory of two linear arms of half density, or the error."""
     built = build("simulation.stiffening=false", "motion.horizon=1.0", *changes, cells=cells)
     return built.evaluate(built.fields(lambda k, x, y: np.full_like(x, 0.5)), simulated=True)[1]
 
 
-def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_deflections_beyond_the_model_are_refused(monkeypatch):
     """Half of an arm's length, by the march, and by what Newton's method finds at once."""
     remedy = r"deflects by [0-9.]+ % .*50 %.*young_modulus"
     with pytest.raises(ConvergenceError, match="t = .* an arm " + remedy):
@@ -273,7 +265,7 @@ def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatc
         arms_of_a_scene("motion.duration=1.0", "payload.mass=1")
 
 
-def test_nothing_moves_without_loads() -> None:
+def test_nothing_moves_without_loads():
     """Zero, not a division by it."""
     problem = two_arms(still, (0.0, 1.0))
     solution = solve(problem, 1e-4)
@@ -281,7 +273,7 @@ def test_nothing_moves_without_loads() -> None:
     assert not solution.sample(np.linspace(0.0, 1.0, 11)).any()
 
 
-def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
+def fine_beam(bending, axial, damping=1e-3):
     """Return a cantilever of many coordinates, frequencies from 1.4 Hz to their squares."""
     # v_k = 1 - cos(p_k u), w_k = sin(p_k u), p_k = (k - 1/2) pi, u = x / length: the second and
     # first derivatives are orthogonal, the stiffness is diagonal in closed form.
@@ -299,25 +291,25 @@ def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
     return Cloud(points, np.full(count, 0.6 / count), modes, K, damping * K, outboard, ends)
 
 
-def fine_arms(bending: int = 6, axial: int = 2, damping: float = 1e-3) -> MachineSystem:
+def fine_arms(bending=6, axial=2, damping=1e-3):
     """Return two such arms with a payload, in motion under gravity."""
     arm = fine_beam(bending, axial, damping).body()
     return MachineSystem(plane_chain([arm] * 2, 1.0, 0.0, (0.0, -9.81), 0.0), reach, ENDS)
 
 
-def slow_up_to(monkeypatch: pytest.MonkeyPatch, *limits: float) -> None:
+def slow_up_to(monkeypatch, *limits):
     """Treat coordinates densely up to these angles, tried in turn, then all."""
     monkeypatch.setattr(newton_matrix, "SLOW_ANGLES", limits)
     monkeypatch.setattr(newton_matrix, "DENSE_COORDINATES", 0)
 
 
 @pytest.fixture
-def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+def matrices(monkeypatch):
     """Return steps and slow coordinates of every matrix that the test will make."""
-    made: list[tuple[int, int]] = []
+    made = []
 
-    def spied(function: Callable[..., NewtonMatrix]) -> Callable[..., NewtonMatrix]:
-        def spy(stages: Stages, *others: Any) -> NewtonMatrix:
+    def spied(function):
+        def spy(stages, *others):
             slow = [x for x in others if isinstance(x, np.ndarray)][-1]
             made.append((len(stages.h), len(slow)))
             return function(stages, *others)
@@ -330,7 +322,7 @@ def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
 
 
 @pytest.mark.parametrize(("damping", "tolerance"), [(0.0, 1e-2), (1e-3, 1e-4), (1.0, 1e-6)])
-def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance) -> None:
+def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance):
     """The same motion and estimate as with the exact matrix."""
     problem = fine_arms(5, 1, damping)
     edges = even_steps(problem, 60)
@@ -344,7 +336,7 @@ def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance) -> Non
 
 
 @pytest.mark.parametrize("bending", [10.0, 1000.0])
-def test_estimate_of_vibrations_that_are_not_resolved(bending: float) -> None:
+def test_estimate_of_vibrations_that_are_not_resolved(bending):
     """Undamped arms, steps from a fifth of the slowest period to five of them."""
     # Estimates of 0.6 to 2.6 times the error were seen, without `unresolved` down to 0.34.
     problem = two_arms(payload=0.0, bending=bending, damping=0.0)
@@ -354,7 +346,7 @@ def test_estimate_of_vibrations_that_are_not_resolved(bending: float) -> None:
         assert 0.6 <= found.error / distance(problem, found, fine) <= 3.0
 
 
-def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]]) -> None:
+def test_cost_hardly_grows_with_the_coordinates(matrices):
     """Blocks of a few slow coordinates of 8, 24, 96; about as many iterations."""
     iterations, slow = [], []
     for bending, axial in ((3, 1), (9, 3), (36, 12)):
@@ -367,7 +359,7 @@ def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]])
     assert max(iterations) <= 24  # on two grids; 18 to 20, by which coordinates are just fast
 
 
-def test_poor_contraction_makes_the_matrix_denser(monkeypatch, matrices) -> None:
+def test_poor_contraction_makes_the_matrix_denser(monkeypatch, matrices):
     """With one slow coordinate where eight are: widened, and solved all the same."""
     problem = fine_arms()
     plain = radau.integrate(problem, 1e-6, 3, Profile())
@@ -379,7 +371,7 @@ def test_poor_contraction_makes_the_matrix_denser(monkeypatch, matrices) -> None
     assert forced.error == pytest.approx(plain.error, rel=0.3)  # other steps
 
 
-def test_dense_matrices_are_kept_small(monkeypatch, matrices) -> None:
+def test_dense_matrices_are_kept_small(monkeypatch, matrices):
     """Steps whose blocks take too much memory are solved a few at a time, forth and back."""
     problem = fine_arms(5, 1)
     edges = even_steps(problem, 60)
@@ -401,12 +393,12 @@ def test_dense_matrices_are_kept_small(monkeypatch, matrices) -> None:
         assert_close(a.W, b.W, 1e-9)
 
 
-def integrals(one: ShapeIntegrals) -> list[np.ndarray]:
+def integrals(one):
     return [one.w[:, 1:], one.M, one.W[1, 1:, 1:], one.K, one.outboard]
 
 
 @pytest.mark.parametrize("limit", [20.0, 1e-3])
-def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limit: float) -> None:
+def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limit):
     """Corrected until it is; of an undamped chain too, and where the matrix must be widened."""
     problem = fine_arms(damping=0.0)
     solution = radau.on_grid(problem, even_steps(problem, 60), 1e-8, 3)
@@ -423,7 +415,7 @@ def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limit: fl
             assert_close(own, other, 1e-8)  # multipliers are corrected to it, largest component
 
 
-def test_warm_start_saves_iterations() -> None:
+def test_warm_start_saves_iterations():
     """From a design one percent stiffer, and from the solution itself."""
     near = two_arms(bending=10.1, axial=303.0)
     problem = two_arms()
@@ -440,7 +432,7 @@ def test_warm_start_saves_iterations() -> None:
     assert np.array_equal(again.time_grid, warm.time_grid)
 
 
-def test_start_of_other_stages_or_size_is_used_or_ignored() -> None:
+def test_start_of_other_stages_or_size_is_used_or_ignored():
     """Another number of stages gives a first guess, another number of coordinates none."""
     problem = two_arms()
     cold = radau.integrate(problem, 1e-5, 3, Profile())

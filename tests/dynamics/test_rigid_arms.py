@@ -1,12 +1,8 @@
 """Machines of rigid arms alone: every command but those that design."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
-from machines import Tree, with_keys
+from machines import with_keys
 from runs import refusal, run, summary_of
 
 import dolfinopt as do
@@ -18,7 +14,7 @@ MASS, INERTIA, LENGTH, LOAD, EARTH = 2.0, 0.3, 1.0, 1.5, 9.81  # kg, kg m2, m, k
 CONTROL = {"stiffness": [2e3], "damping": [20.0]}
 
 
-def pendulum(folder: Path, **tables) -> Tree:
+def pendulum(folder, **tables):
     """Return one rigid arm with a payload on a table of its angle."""
     (folder / "swing.csv").write_text("t,arm\n0,-1.0\n0.6,0.8\n")
     tree = {
@@ -34,7 +30,7 @@ def pendulum(folder: Path, **tables) -> Tree:
 
 
 @pytest.mark.parametrize("control", [None, CONTROL])
-def test_torque_of_a_pendulum(control, tmp_path) -> None:
+def test_torque_of_a_pendulum(control, tmp_path):
     """(J + m L^2 / 4 + M L^2) qdd + (m / 2 + M) g L cos q; under control the same, and no error."""
     result = do.Model(pendulum(tmp_path, control=control)).simulate()
     seen = result.trajectory.sampled
@@ -45,7 +41,7 @@ def test_torque_of_a_pendulum(control, tmp_path) -> None:
     assert np.abs(seen.motion.qdd).max() > 1.0 and result.max_deviation < 1e-12
 
 
-def test_commands(tmp_path, capsys) -> None:
+def test_commands(tmp_path, capsys):
     """Simulated, drawn anew, swept, exported; to optimise there is nothing."""
     scene, out = tmp_path / "scene.toml", tmp_path / "run"
     scene.write_text(toml_text(pendulum(tmp_path)))
@@ -66,6 +62,6 @@ def test_commands(tmp_path, capsys) -> None:
 
 
 @pytest.mark.parametrize("kind", ["eigenfrequency", "stress", "static"])
-def test_responses_of_flexible_arms(kind: str, tmp_path) -> None:
+def test_responses_of_flexible_arms(kind, tmp_path):
     tree = pendulum(tmp_path, objective={"kind": kind})
     refusal(lambda: scene_from_dict(tree), "objective.kind", "no arm is flexible")

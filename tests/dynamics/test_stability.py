@@ -1,25 +1,17 @@
 """Extremes: every outcome is right by an independent path, or one of the two named errors."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.sparse
 from machines import distance
-from remainders import Built, Field, arm_of, build, uneven, wave
+from remainders import arm_of, build, uneven, wave
 from runs import TWO_ARM, overrides, run, summary_of
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.build import Trajectory
-from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.fem.interface import rounding_error
 from dolfinopt.fem.measured import ROUNDING_ERROR_LIMIT
 from dolfinopt.multibody.newton_euler import inverse_dynamics
@@ -32,17 +24,17 @@ EXTENDED = pytest.mark.skipif(
 )
 
 
-def alone(*overrides: str, cells: tuple[int, int] = (16, 3)) -> Built:
+def alone(*overrides, cells=(16, 3)):
     """Build the two-arm scene on few cells."""
     return build("simulation.stiffening=false", *overrides, cells=cells)
 
 
-def one_arm(*overrides: str, cells: tuple[int, int] = (12, 3)) -> Arm:
+def one_arm(*overrides, cells=(12, 3)):
     """Build the first arm of that scene."""
     return arm_of(cells, "simulation.stiffening=false", *overrides)
 
 
-DESIGNS: dict[str, Field] = {
+DESIGNS = {
     "solid": lambda k, x, y: np.ones_like(x),
     "void": lambda k, x, y: np.zeros_like(x),
     # By lot, in the same places on any partition.
@@ -53,7 +45,7 @@ DESIGNS: dict[str, Field] = {
 }
 
 
-def windows(arm: Arm, count: int, density: float) -> np.ndarray:
+def windows(arm, count, density):
     """Return a frame with equal windows."""
     x, y = arm.mesh.centroid.T / arm.mesh.outboard_point[0]
     place = (x * count) % 1.0
@@ -62,7 +54,7 @@ def windows(arm: Arm, count: int, density: float) -> np.ndarray:
     return np.where(inside, density, 1.0)
 
 
-def quadrilateral(a: float, b: float, nu: float) -> np.ndarray:
+def quadrilateral(a, b, nu):
     """Return the plane stress matrix (8, 8) of a rectangle a by b, E = t = 1, in long double."""
     # Incompatible modes (QM6), which are orthogonal on a rectangle. Nodes (0, 0), (a, 0), (0, b),
     # (a, b); its null space is that of a rigid body to 1e-19.
@@ -82,7 +74,7 @@ def quadrilateral(a: float, b: float, nu: float) -> np.ndarray:
     return K[:8, :8] - (K[:8, 8:] / np.diag(K)[8:]) @ K[8:, :8]
 
 
-def exact_compliance(arm: Arm) -> np.ndarray:
+def exact_compliance(arm):
     """Return S^-1 (3, 3) of a rectangular arm from a dense factorisation in long double."""
     keys = arm.scene.arms[0]
     (nx, ny), length, height = keys.cells, keys.length, keys.height
@@ -115,7 +107,7 @@ def exact_compliance(arm: Arm) -> np.ndarray:
     return inverse.T @ inverse
 
 
-def compliance_error(arm: Arm) -> float:
+def compliance_error(arm):
     """Return the largest relative error of S^-1 under any load."""
     found = np.linalg.inv(arm.elastic.constraint_modes.stiffness)
     exact = exact_compliance(arm)
@@ -125,7 +117,7 @@ def compliance_error(arm: Arm) -> float:
 
 @EXTENDED
 @pytest.mark.parametrize("name", DESIGNS)
-def test_contrast(name: str) -> None:
+def test_contrast(name):
     """Voids of 1e-3 to 1e-24 of solid: right to 4e-3, or an error that names the remedy."""
     # Nothing that hangs together, or floats in a void of 1e-9 and more, is refused. Where solids
     # float, the bound of rounding exceeds the error.
@@ -151,7 +143,7 @@ def test_contrast(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["checkerboard", "gap", "islands"])
 @pytest.mark.parametrize("cells", [(12, 3), (60, 4)])
-def test_rounding_of_floating_solids(name: str, cells: tuple[int, int]) -> None:
+def test_rounding_of_floating_solids(name, cells):
     """The bound is proportional to 1 / contrast up to where it refuses, to 5 %."""
     # So it does not itself depend on rounding, which differs from machine to machine. Beyond, every
     # contrast is refused, whatever rounding makes of it.
@@ -169,7 +161,7 @@ def test_rounding_of_floating_solids(name: str, cells: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, -1.0])
-def test_a_stiffness_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, wrong: float) -> None:
+def test_a_stiffness_that_is_none_is_named(monkeypatch, wrong):
     """Neither NaN nor a negative stiffness ends in an error of linear algebra."""
     arm = one_arm("interpolation.floor=1e-9")
     for field in ("solid", "islands"):
@@ -188,7 +180,7 @@ def test_a_stiffness_that_is_none_is_named(monkeypatch: pytest.MonkeyPatch, wron
         *[(0.01, (30, 2)), (1e-3, (40, 1)), (1e-4, (40, 1)), (0.06, (40, 1)), (0.06, (2, 30))],
     ],
 )
-def test_shapes(height: float, cells: tuple[int, int]) -> None:
+def test_shapes(height, cells):
     """Arms of aspect 1/2 to 1e4, cells of 1/50 to 200: statics right to what K's digits allow."""
     # Bending stiffness is (height / length)^2 of the axial one: 1e-8 at 1e4. A cell that bends has
     # (height / length)^2 of the stiffness to its shear, which its matrix is the difference of. At
@@ -199,7 +191,7 @@ def test_shapes(height: float, cells: tuple[int, int]) -> None:
     assert compliance_error(arm) < max(1e-9 / min(height, 1.0), 5e-14 / (slender * height) ** 2)
 
 
-def dense_eigenvalues(arm: ElasticArm, count: int) -> np.ndarray:
+def dense_eigenvalues(arm, count):
     """Return the lowest eigenvalues of the interior: the largest of L^-1 M L^-T, K = L L'."""
     pencil, unit = Pencil(arm), np.eye(arm.num_interior)
     K, M = pencil.stiffness(unit), pencil.mass(unit)
@@ -209,7 +201,7 @@ def dense_eigenvalues(arm: ElasticArm, count: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("count", "density", "floor"), [(5, 1e-3, 1e-6), (6, 1e-6, 1e-12), (10, 1e-5, 1e-12)]
 )
-def test_equal_windows(count: int, density: float, floor: float) -> None:
+def test_equal_windows(count, density, floor):
     """Bundles of modes, equal to 1e-7 or to 1e-13: none fails, none of them is passed over."""
     arm = one_arm("interpolation.law=simp", f"interpolation.floor={floor}", cells=(40, 6))
     arm.state(windows(arm, count, density))
@@ -229,9 +221,7 @@ def test_equal_windows(count: int, density: float, floor: float) -> None:
             np.testing.assert_allclose(warm, exact[:modes], rtol=1e-7)
 
 
-def moved(
-    *overrides: str, field: Field = DESIGNS["solid"], cells: tuple[int, int] = (12, 2)
-) -> Trajectory:
+def moved(*overrides, field=DESIGNS["solid"], cells=(12, 2)):
     """Simulate."""
     built = alone(*overrides, cells=cells)
     _, trajectory = built.evaluate(built.fields(field), simulated=True)
@@ -261,7 +251,7 @@ def moved(
     ],
     ids=" ".join,
 )
-def test_motions(overrides: list[str]) -> None:
+def test_motions(overrides):
     """The tolerance is met, measured by a method of other order on other, finer steps."""
     trajectory = moved(*overrides)
     fine = radau.integrate(trajectory.problem, 1e-5, 5, do.Profile())
@@ -269,7 +259,7 @@ def test_motions(overrides: list[str]) -> None:
     assert distance(trajectory.problem, trajectory.solution, fine, 5000) < 1.1e-4
 
 
-def quasi_static(problem: MachineSystem, t: np.ndarray) -> np.ndarray:
+def quasi_static(problem, t):
     """Return K^-1 (- rows of the undeformed mechanism) at instants t."""
     rest = np.zeros((len(t), problem.mechanism.num_coordinates))
     rows = inverse_dynamics(problem.mechanism, problem.motion(t), rest, rest, rest)[0]
@@ -277,7 +267,7 @@ def quasi_static(problem: MachineSystem, t: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("young_modulus", [1e14, 1e15])
-def test_stiff_arms_follow_their_loads(young_modulus: float) -> None:
+def test_stiff_arms_follow_their_loads(young_modulus):
     """q + beta qd is the static deflection, off by (slowest frequency x time of the motion)^-2."""
     times = ["motion.duration=0.5", "motion.horizon=0.5"]
     trajectory = moved(f"material.young_modulus={young_modulus}", *times)
@@ -311,7 +301,7 @@ MILLIMETRES = [  # mm, t, s, N
     ],
     ids=str,
 )  # fmt: skip
-def test_millimetres_and_tonnes(overrides, in_metres, in_millimetres) -> None:
+def test_millimetres_and_tonnes(overrides, in_metres, in_millimetres):
     """The same figures as in metres and kilograms, to what Newton's iteration leaves."""
     found = []
     for own in (in_metres, [*MILLIMETRES, *in_millimetres]):
@@ -330,7 +320,7 @@ def test_millimetres_and_tonnes(overrides, in_metres, in_millimetres) -> None:
         np.testing.assert_allclose(mm_slopes[k] / factor, slopes, atol=3e-6 * scale)
 
 
-def test_large_deflections_are_warned_of(tmp_path: Path, capsys) -> None:
+def test_large_deflections_are_warned_of(tmp_path, capsys):
     """A tenth of an arm's length: in summary.json and on standard error, arm by arm."""
     heavy = ["payload.mass=40", "arms.arm2.young_modulus=1e12"]
     for name, more in (("small", []), ("large", [*heavy, "simulation.stiffening=false"])):

@@ -1,7 +1,5 @@
 """Systems and vibrations as integrators see them: an interface, and steps too long for them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bodies import beam, plane_chain
@@ -26,12 +24,12 @@ QUINTIC = law_for("quintic", 1.0, Limits(), 0.25)
 GRAVITY = 9.81  # m/s2
 
 
-def desired(t: np.ndarray) -> RigidMotion:
+def desired(t):
     """Return a quintic motion of cart and joint over 0.3 s."""
     return RigidMotion(*(np.outer(x, [0.3, 0.8]) for x in QUINTIC(t, 0.3)))
 
 
-def controlled(gains: float, gravity: float = -GRAVITY) -> MachineSystem:
+def controlled(gains, gravity=-GRAVITY):
     """Return an arm of one mode on a cart, its drives with or without gains, no feed-forward."""
     one_mode = beam(damping=1e-3).body().in_basis(np.array([[1.0], [0.5], [0.0]]))
     drives = Drives(
@@ -42,12 +40,12 @@ def controlled(gains: float, gravity: float = -GRAVITY) -> MachineSystem:
     return MachineSystem(mechanism, desired, (0.0, 0.3, 0.5), drives)
 
 
-def by_scipy(system: MachineSystem, t: np.ndarray) -> np.ndarray:
+def by_scipy(system, t):
     """Return y (n, S) by SciPy's explicit method, accelerations from the mass matrix."""
     size = system.num_coordinates
     state = np.concatenate([x[0] for x in system.initial_state()])
 
-    def slopes(time: float, y: np.ndarray) -> np.ndarray:
+    def slopes(time, y):
         at, many = system.at(np.full(1 + size, time)), np.ones((1 + size, 1))
         unit = np.vstack([np.zeros(size), np.eye(size)])
         rows = at.residual(y[:size] * many, y[size:] * many, unit)
@@ -65,7 +63,7 @@ def by_scipy(system: MachineSystem, t: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("gains", "tolerance"), [(1.0, 1e-8), (0.0, 1e-7)])
-def test_free_joints_move_as_scipys(gains: float, tolerance: float) -> None:
+def test_free_joints_move_as_scipys(gains, tolerance):
     """Free rigid coordinates beside elastic ones, with drives and without: then it swings down."""
     system = controlled(gains)
     solution = radau.integrate(system, tolerance, 5, Profile())
@@ -82,7 +80,7 @@ def test_free_joints_move_as_scipys(gains: float, tolerance: float) -> None:
 
 @pytest.mark.parametrize("stages", [2, 3, 4])
 @pytest.mark.parametrize("z", [0.3j, 2.0j, -0.1 + 5.0j, -3.0 + 0.0j])
-def test_lost_is_what_collocation_makes_of_a_free_vibration(stages: int, z: complex) -> None:
+def test_lost_is_what_collocation_makes_of_a_free_vibration(stages, z):
     """y' = z y over unit steps, the stages' equations solved one step after the other."""
     method = radau_iia(stages)
     y, apart, each = 1.0 + 0.0j, [], []

@@ -1,14 +1,12 @@
 """Bodies in the standard's format, of plane and space: round trips, forces by its numbers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from bodies import random_cloud, random_tree
 from bodies import stiffened as bent
-from readers import State, forces_of_sid, random_state
+from readers import forces_of_sid, random_state
 from runs import refused
 
 from dolfinopt.exchange.in_space import in_space
@@ -17,9 +15,8 @@ from dolfinopt.multibody.body import BodyMotion, Constants
 from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import TABLE
 from dolfinopt.scene.sid import (
-    StandardInputData,
     Taylor,
     read_sid,
     write_sid,
@@ -31,12 +28,12 @@ pytestmark = pytest.mark.serial  # ranks have no part in it
 ROUNDING = 1e-12
 
 
-def assert_close(found, expected, tolerance=ROUNDING, size=1.0) -> None:
+def assert_close(found, expected, tolerance=ROUNDING, size=1.0):
     scale = max(size, float(np.abs(expected).max(initial=0.0)))
     assert np.abs(np.asarray(found) - expected).max(initial=0.0) < tolerance * scale
 
 
-def stiffened(body: ShapeIntegrals, seed: int) -> ShapeIntegrals:
+def stiffened(body, seed):
     """Return the body with geometric stiffness, but what the inertia of the modes stiffens.
 
     The format does not hold that.
@@ -45,7 +42,7 @@ def stiffened(body: ShapeIntegrals, seed: int) -> ShapeIntegrals:
     return replace(found, along_modes=np.zeros((0, body.num_modes, body.num_modes)))
 
 
-def body_of(dimension: int, seed: int, q: int) -> ShapeIntegrals:
+def body_of(dimension, seed, q):
     """Return a body with matrices that are symmetric or skew in all bits, as arms have them."""
     body = random_cloud(np.random.default_rng(seed), q, dimension).body()
     if dimension == 3:
@@ -58,11 +55,11 @@ PLANE_AND_SPACE = pytest.mark.parametrize("dimension", [2, 3])
 STIFF = pytest.mark.parametrize("stiff", [False, True])
 
 
-def sid_of(body: ShapeIntegrals, comment: str = "") -> StandardInputData:
+def sid_of(body, comment=""):
     return to_sid(body if len(body.w) == 3 else in_space(body), comment)
 
 
-def same(found: ShapeIntegrals, body: ShapeIntegrals) -> None:
+def same(found, body):
     """Assert that a plane body is back in every bit, one in space to rounding."""
     for one in TABLE:
         a, b = (np.asarray(getattr(x, one.name), dtype=float) for x in (found, body))
@@ -122,7 +119,7 @@ def test_several_interfaces(tmp_path, stiff):
         from_sid(data, 3, further=["tool"])
 
 
-def moving(body: ShapeIntegrals, s: State) -> BodyMotion:
+def moving(body, s):
     frame = tuple(x[:, None] for x in (s.a, s.w, s.g))
     return BodyMotion(Constants(body), frame, np.stack([s.q, s.qd, s.qdd], axis=1)[:, :, None])
 

@@ -11,7 +11,7 @@ from runs import ROOT, refusal, run, summary_of
 
 from dolfinopt.cli.exchange import _check_robot
 from dolfinopt.exchange.urdf.file import NewLink, implausible_inertias, read_robot, robot_text
-from dolfinopt.exchange.urdf.robot import Inertia, Robot, default_tool, scene_bodies
+from dolfinopt.exchange.urdf.robot import Inertia, default_tool, scene_bodies
 from dolfinopt.exchange.urdf.scene import read_origin
 from dolfinopt.plots.style import new_figure
 from dolfinopt.scene.schema import file_digest
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.serial
 LINK = ROOT / "demos" / "robot_link.toml"
 
 
-def same_kinematics(one: Robot, other: Robot) -> bool:
+def same_kinematics(one, other):
     """Return whether all joints are alike, to the last bit."""
     told = ("name", "kind", "parent", "child", "lower", "upper", "velocity", "effort")
     return all(

@@ -1,7 +1,5 @@
 """The elements: patch test, bending, rates of convergence; a form of a test's own beside them."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
@@ -212,7 +210,7 @@ CALCULIX = np.array([66.025, 131.345, 410.674, 799.482, 1136.69, 1166.71])
 
 
 @cache
-def frequencies(name: str, shape: str, cells: tuple[int, int, int]) -> np.ndarray:
+def frequencies(name, shape, cells):
     """Return the first six of the link clamped at x = 0, the other end free, Hz."""
     return solids.frequencies(elastic_link(name, link_mesh(shape, cells)), 6)
 
@@ -234,7 +232,7 @@ def test_clamped_link():
     assert 0.0 < errors.min() and errors[:5].max() < 0.005 and errors[5] < 0.025
 
 
-def torsion_constant(element: str, sides: tuple[float, float], cells: tuple[int, int]) -> float:
+def torsion_constant(element, sides, cells):
     """Return J of a slice of cells whose section turns and warps, the same along the slice."""
     long = sides[1] / cells[1]
     mesh = box_arm(MPI.COMM_SELF, "a", (long, *sides), (1, *cells))

@@ -1,7 +1,5 @@
 """Material laws: orthotropic ones against closed forms and published beams, laws of one's own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import solids

@@ -1,7 +1,5 @@
 """Derivatives of what cells add to by the places of their corners, against differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_rectangle
@@ -26,7 +24,7 @@ ELEMENTS_OF = [
 ]  # fmt: skip
 
 
-def even_mesh(shape: str) -> ArmMesh:
+def even_mesh(shape):
     """Return a regular mesh of these cells."""
     if shape in ("triangle", "quadrilateral"):
         corners = [np.array([0.0, -0.02]), np.array([0.2, 0.02])]
@@ -40,12 +38,12 @@ def even_mesh(shape: str) -> ArmMesh:
     return link_mesh(shape, (3, 2, 1))
 
 
-def direction(mesh: ArmMesh) -> np.ndarray:
+def direction(mesh):
     """Return random moves (n, d) of a regular mesh's nodes, m."""
     return SIZE * noise("a", mesh.mesh.geometry.x[:, : mesh.dim])
 
 
-def mesh_of(shape: str, h: float) -> ArmMesh:
+def mesh_of(shape, h):
     """Return an uneven mesh, its nodes moved by h times `direction`."""
     even = even_mesh(shape)
     uneven = SIZE * noise("a", even.mesh.geometry.x[:, : even.dim], 5)
@@ -53,7 +51,7 @@ def mesh_of(shape: str, h: float) -> ArmMesh:
 
 
 @pytest.mark.parametrize(("shape", "element"), ELEMENTS_OF)
-def test_the_same_by_ufl(shape: str, element: str) -> None:
+def test_the_same_by_ufl(shape, element):
     """Eshelby's tensor against UFL's derivative of the form, to rounding."""
     operators = tensors_of(mesh_of(shape, 0.0), element, 1.0, 0.3)
     cell, derivative = operators.cell, ShapeDerivative(operators)

@@ -1,7 +1,5 @@
 """Meshes: the parametric geometry, its groups, facets between cells, boxes and uniform members."""
 
-from __future__ import annotations
-
 import json
 import math
 import subprocess
@@ -287,7 +285,7 @@ def test_volumes_of_skew_cells():
 FIVE = np.array([[0, 1, 2, 4], [3, 1, 2, 7], [5, 1, 4, 7], [6, 2, 4, 7], [1, 2, 4, 7]])
 
 
-def row() -> tuple[np.ndarray, np.ndarray]:
+def row():
     """Return points and cells of three cubes in a row along z."""
     grid = np.stack(np.meshgrid(np.arange(4), [0, 1], [0, 1], indexing="ij"), axis=3)
     return grid.reshape(-1, 3)[:, ::-1].astype(float), np.arange(8) + 4 * np.arange(3)[:, None]
@@ -298,7 +296,7 @@ FAN = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.1, 0.1, 1], [0.1, 0.1, -1], 
 THREE = np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]])
 
 
-def changed(place: int, *value: float) -> np.ndarray:
+def changed(place, *value):
     points = row()[0]
     points[place] = value
     return points

@@ -1,9 +1,5 @@
 """Solid and hollow arms from STEP, .geo and .msh files: groups, interfaces by place, refusals."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -13,7 +9,7 @@ from solids import HEIGHT, LENGTH, THICKNESS, solid_arm
 import dolfinopt as do
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
+from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import cell_sizes, check_cells, facet_corners
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.mesh.hollow import Member, Wall, box_hull, tube_hull
@@ -34,17 +30,17 @@ Physical Surface("Outboard") = {{Surface In BoundingBox {{0.499999, -1, -1, 0.50
 """
 
 
-def mesh_of(path: Path, **keys: object) -> ArmMesh:
+def mesh_of(path, **keys):
     told = {"cell_shape": "tetrahedron"} | keys
     return arm_mesh(COMM, Arm(**KEYS | told, mesh=str(path)))
 
 
-def sums(mesh: ArmMesh) -> np.ndarray:
+def sums(mesh):
     """Return volume, solid volume and the areas of both interfaces as the mass they carry."""
     return COMM.allreduce(np.array([mesh.area.sum(), mesh.area[mesh.passive].sum()]))
 
 
-def written(folder: Path, name: str, bored: bool, *more: float) -> Path:
+def written(folder, name, bored, *more):
     """Write the box, or a bar with bores about both joint axes and more, as a file of Gmsh's."""
     path = folder / name
     with gmsh_on_root(COMM) as gmsh:
@@ -75,7 +71,7 @@ def test_geo_with_groups(write):
     assert mesh.dim == 3 and np.array_equal(mesh.outboard_point, [LENGTH, 0.0, 0.0])
 
 
-def facets_at(mesh: ArmMesh, facets: np.ndarray) -> np.ndarray:
+def facets_at(mesh, facets):
     """Return the middles (n, 3) of facets of tetrahedra, of all ranks."""
     corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
     middles = corners[:, np.array(facet_corners(3, 4))].mean(axis=2)
@@ -117,7 +113,7 @@ def test_step_without_names(shared_tmp_path, bored):
     assert COMM.allreduce(np.array(ends)).min() >= 8
 
 
-def row_of_cubes(path: Path) -> Path:
+def row_of_cubes(path):
     """Write one layer of hexahedra along the arm as Gmsh's file."""
     places = [(x, y, z) for x in np.linspace(0.0, LENGTH, 3) for y in (-0.5, 0.5)
               for z in (-0.5, 0.5)]  # fmt: skip
@@ -273,7 +269,7 @@ def test_what_a_hollow_arm_cannot_have(changes, words):
         do.load_scene(ROOT / "demos" / "two_arm.toml", ("arms.hollow=true", "arms.wall=0.002"))
 
 
-def taper() -> Member:
+def taper():
     """Return a solid whose section shrinks along it from 60 x 40 mm to half of both."""
     counts = np.array([7, 5, 5])
     grid = np.indices(counts).reshape(3, -1).T / (counts - 1.0)
@@ -289,7 +285,7 @@ def taper() -> Member:
     return Member(points, hexahedra, first[:, ::-1], last)
 
 
-def hull_arm(tmp_path, mesh: Member, **keys):
+def hull_arm(tmp_path, mesh, **keys):
     """Return the arm whose hull is a mesh's."""
     path = tmp_path / "hull.msh"
     path.write_bytes(msh_bytes(mesh))

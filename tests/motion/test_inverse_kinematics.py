@@ -1,7 +1,5 @@
 """Inverse kinematics in space: closed form, a six-axis robot, joints from the table, refusals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

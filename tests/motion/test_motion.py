@@ -3,12 +3,9 @@
 At the end scenes with one and three arms, from the motion to the gradient.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,8 +16,7 @@ from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, forced_rest, rigid_motion
 from dolfinopt.motion.measured import TABLE_CORNERS_LIMIT
-from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -46,11 +42,11 @@ SCENES = pytest.mark.parametrize(
 
 
 def scene(
-    lengths: tuple[float, ...] = (1.0, 1.0),
-    tables: dict[str, Any] | None = None,
-    cells: tuple[int, int] = (20, 2),
-    **motion: Any,
-) -> Scene:
+    lengths=(1.0, 1.0),
+    tables=None,
+    cells=(20, 2),
+    **motion,
+):
     """Return the paper's example with these arms, this motion and other tables of the scene."""
     section = {"height": 0.06, "thickness": 0.01, "cells": list(cells), "passive": 0.0}
     return scene_from_dict(
@@ -67,7 +63,7 @@ def scene(
     )
 
 
-def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
+def end_points(motion, of):
     """Return the rigid chain's end-effector (n, 2)."""
     lengths = np.array([arm.length for arm in of.arms])
     angles = np.cumsum(motion.q[:, 1:], axis=1)
@@ -76,7 +72,7 @@ def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
 
 
 @pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
-def test_arc_runs_from_left_over_the_top_to_right(flattening: float) -> None:
+def test_arc_runs_from_left_over_the_top_to_right(flattening):
     """On the ellipse, monotone in x, a straight line when it is flattened altogether."""
     of = scene(radius=0.9, flattening=flattening)
     path = desired_path(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), of)
@@ -93,7 +89,7 @@ def test_arc_runs_from_left_over_the_top_to_right(flattening: float) -> None:
         assert_close(by, path[k + 1], DIFFERENCES)
 
 
-def assert_rates(of: Scene, t: np.ndarray) -> None:
+def assert_rates(of, t):
     """Assert that rates are the coordinates' derivatives at t, by differences."""
     here = rigid_motion(t, of)
     for key, rate in (("q", here.qd), ("qd", here.qdd)):
@@ -102,7 +98,7 @@ def assert_rates(of: Scene, t: np.ndarray) -> None:
 
 
 @SCENES
-def test_two_arms_trace_the_arc(keys: dict[str, Any]) -> None:
+def test_two_arms_trace_the_arc(keys):
     """With the elbow on the side asked for and the cart where it should be; then all is at rest."""
     of = scene(**keys)
     motion, path = rigid_motion(DENSE, of), desired_path(DENSE, of)
@@ -141,13 +137,13 @@ MOTIONS = [
 ]
 
 
-def joint_rows(columns: int) -> np.ndarray:
+def joint_rows(columns):
     """Return joint coordinates at `TIMES` (n, columns)."""
     k = np.arange(columns)
     return 0.4 * np.sin(TIMES[:, None] * (1.0 + 0.7 * k) + k) + 0.2 * k
 
 
-def table_text(path: str, arms: int, base: str) -> str:
+def table_text(path, arms, base):
     """Return a table of points or joints, with times where the path's name says so."""
     names, rows = ["x", "y"], POINTS
     if path.startswith("joints"):
@@ -158,7 +154,7 @@ def table_text(path: str, arms: int, base: str) -> str:
     return "\n".join([",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())])
 
 
-def of_kind(folder: Path, arms: int, path: str, law: str, base: str, **keys: Any) -> Scene:
+def of_kind(folder, arms, path, law, base, **keys):
     """Return one of `MOTIONS`, with its table in `folder`."""
     motion = {**PATHS[path], **BASES[base], "law": law, **keys}
     if motion["path"] in ("points", "joints"):
@@ -168,7 +164,7 @@ def of_kind(folder: Path, arms: int, path: str, law: str, base: str, **keys: Any
 
 
 @pytest.mark.parametrize(("arms", "path", "law", "base"), MOTIONS)
-def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str) -> None:
+def test_every_motion(tmp_path, arms, path, law, base):
     """Traces the path or the rows; rates by differences; continuous, at rest at both ends."""
     of = of_kind(tmp_path, arms, path, law, base)
     check_motion(of)
@@ -228,7 +224,7 @@ UNREACHABLE = [  # arms, motion, worst instant and distance there, what it is, k
 
 
 @pytest.mark.parametrize(("lengths", "keys", "time", "distance", "words", "key"), UNREACHABLE)
-def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key) -> None:
+def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key):
     """In one line the worst instant, the distance there, and the keys that help."""
     with pytest.raises(InputError) as caught:
         check_motion(scene(lengths, **keys))
@@ -240,7 +236,7 @@ def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key) 
 
 
 @pytest.mark.parametrize("law", ["quintic", "septic", "trapezoidal", "s-curve"])
-def test_points_of_a_straight_line_are_the_line(tmp_path: Path, law: str) -> None:
+def test_points_of_a_straight_line_are_the_line(tmp_path, law):
     """Whatever their distances; without times the law of the scene holds until the last instant.
 
     There a trapezoidal speed still brakes; a jump within a step would cost the integrator many.
@@ -260,7 +256,7 @@ def test_points_of_a_straight_line_are_the_line(tmp_path: Path, law: str) -> Non
     assert (np.abs(last).max() > 0.1) == (law == "trapezoidal")
 
 
-def test_breakpoints(tmp_path: Path) -> None:
+def test_breakpoints(tmp_path):
     """The end of the path, and the rows of a short table without times."""
     assert breakpoints(scene()) == (0.0, DURATION, 3.0)
     assert breakpoints(scene(horizon=DURATION)) == (0.0, DURATION)
@@ -279,7 +275,7 @@ def test_breakpoints(tmp_path: Path) -> None:
     assert breakpoints(scene(path="points", file=str(file))) == (0.0, DURATION, 3.0)
 
 
-def test_changed_table_is_read_anew(tmp_path: Path) -> None:
+def test_changed_table_is_read_anew(tmp_path):
     """The curve is kept, but not longer than the file."""
     file = tmp_path / "points.csv"
     file.write_text("x,y\n-0.5,0\n0.5,0\n")
@@ -307,7 +303,7 @@ def test_changed_table_is_read_anew(tmp_path: Path) -> None:
     ],
     ids=["duration", "law", "no cart", "cart"],
 )  # fmt: skip
-def test_table_that_does_not_suit_the_scene(tmp_path, text, keys, words) -> None:
+def test_table_that_does_not_suit_the_scene(tmp_path, text, keys, words):
     """One line that says what to set."""
     file = tmp_path / "joints.csv"
     file.write_text(text)
@@ -318,7 +314,7 @@ def test_table_that_does_not_suit_the_scene(tmp_path, text, keys, words) -> None
 
 
 @pytest.mark.parametrize("name", ["t", "cart"])
-def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
+def test_arm_with_the_name_of_another_column(tmp_path, name):
     """Its column would have two meanings."""
     file = tmp_path / "joints.csv"
     file.write_text("t,cart,arm1\n0,0,0\n1,1,1\n")
@@ -329,7 +325,7 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
         check_motion(of.unchecked_copy({"arms": arms}))
 
 
-def sampled(folder: Path, count: int = 200, **keys: Any) -> Scene:
+def sampled(folder, count=200, **keys):
     """Return joints that swing as 0.6 sin(2 t), a recording from the midst of the motion."""
     t = np.linspace(0.0, 0.5, count)
     rows = np.column_stack([t, 0.3 * t, 0.6 * np.sin(2.0 * t), 0.5 * np.cos(2.0 * t)])
@@ -341,7 +337,7 @@ def sampled(folder: Path, count: int = 200, **keys: Any) -> Scene:
 
 
 @pytest.mark.parametrize("count", [4, 6, 200])
-def test_a_table_may_move_at_its_ends(tmp_path: Path, count: int) -> None:
+def test_a_table_may_move_at_its_ends(tmp_path, count):
     """At its own rates there, and no rest is forced upon it; its horizon is its own."""
     of = sampled(tmp_path, count, table_ends="moving")
     assert of.motion.horizon == of.motion.duration == 0.5
@@ -353,7 +349,7 @@ def test_a_table_may_move_at_its_ends(tmp_path: Path, count: int) -> None:
     assert forced_rest(of) is None
 
 
-def test_a_forced_rest_is_told(tmp_path: Path) -> None:
+def test_a_forced_rest_is_told(tmp_path):
     """With the acceleration that it needs, that of the rows, and the key that takes their rates."""
     of = sampled(tmp_path)
     motion = rigid_motion(np.linspace(0.0, 0.5, 4001), of)

@@ -1,10 +1,6 @@
 """Time laws against closed forms, differences and their limits; tables with stops."""
 
-from __future__ import annotations
-
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +12,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
 from dolfinopt.motion.paths import curve_by_chord, curve_in_time
 from dolfinopt.scene.csv_table import Table, read_table
-from dolfinopt.scene.laws import Law, Limits, ShapedLaw, law_for
-from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
+from dolfinopt.scene.laws import Limits, ShapedLaw, law_for
+from dolfinopt.scene.load import read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -25,17 +21,17 @@ LAWS = ["quintic", "septic", "trapezoidal", "s-curve"]
 EVERY = pytest.mark.parametrize("name", LAWS)
 
 
-def law_of(name: str, share: float = 0.25, length: float = 1.0, **limits: float) -> Law:
+def law_of(name, share=0.25, length=1.0, **limits):
     """Return the law on a path of that length, m."""
     return law_for(name, length, Limits(**limits), share)
 
 
-def pieces(law: Law, duration: float) -> np.ndarray:
+def pieces(law, duration):
     """Return the ends of the law's smooth pieces, s."""
     return np.array([0.0, *(law.knots * duration), duration])
 
 
-def peaks(law: Law, duration: float, length: float) -> np.ndarray:
+def peaks(law, duration, length):
     """Return the largest speed, acceleration and jerk, the latter from cubics through samples."""
     largest = np.zeros(3)
     for a, b in np.stack([pieces(law, duration)[:-1], pieces(law, duration)[1:]], axis=1):
@@ -52,7 +48,7 @@ def peaks(law: Law, duration: float, length: float) -> np.ndarray:
 
 @EVERY
 @pytest.mark.parametrize("share", [0.05, 0.25, 0.5])
-def test_speed_is_the_rate_and_its_area_the_distance(name: str, share: float) -> None:
+def test_speed_is_the_rate_and_its_area_the_distance(name, share):
     """By Gauss' rule between the knots, exact there; acceleration likewise to the speed."""
     law, duration = law_of(name, share), 1.7
     ends = pieces(law, duration)
@@ -68,7 +64,7 @@ def test_speed_is_the_rate_and_its_area_the_distance(name: str, share: float) ->
         assert_close(before, [2.0 - order], 1e-13, 1.0)
 
 
-def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives() -> None:
+def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives():
     """(4 u (1 - u))^3 leaves place, speed and acceleration at the ends; by Gauss' rule."""
     law, duration = ShapedLaw(law_of("quintic"), (0.1, -0.2, 0.15)), 0.7
     ends = law(np.array([0.0, duration]), duration)
@@ -85,7 +81,7 @@ def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives() -> No
     assert abs(law(np.array([0.2]), duration)[0] - law.base(np.array([0.2]), duration)[0]) > 0.01
 
 
-def test_peaks_in_closed_form() -> None:
+def test_peaks_in_closed_form():
     """Largest speed and acceleration of a move of 1 m in 1 s."""
     for name, speed, acceleration in (
         ("quintic", 15 / 8, 10 / np.sqrt(3)), ("septic", 35 / 16, 84 * np.sqrt(5) / 25),
@@ -98,7 +94,7 @@ def test_peaks_in_closed_form() -> None:
 
 
 @EVERY
-def test_limits_are_met_exactly(name: str) -> None:
+def test_limits_are_met_exactly(name):
     """At the least duration one of them is reached and none exceeded, whichever binds."""
     rng = np.random.default_rng(5)
     binding = set()
@@ -123,13 +119,13 @@ def test_limits_are_met_exactly(name: str) -> None:
     assert len(binding) == (2 if name == "trapezoidal" else 3)
 
 
-def posed(**motion: Any) -> Scene:
+def posed(**motion):
     """Return the example with another motion."""
     data = read_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()
     return scene_from_dict(data | {"motion": {"path": "arc"} | motion}, "test.toml")
 
 
-def test_duration_follows_from_the_limits() -> None:
+def test_duration_follows_from_the_limits():
     """Unless stated; values that follow stay free in changes, and a short one is refused."""
     limits = {"law": "trapezoidal", "max_speed": 2.0, "max_acceleration": 5.0}
     of = posed(**limits)
@@ -159,7 +155,7 @@ def test_duration_follows_from_the_limits() -> None:
          ["max_speed", 'none with path = "joints"']),
     ],
 )  # fmt: skip
-def test_values_that_do_not_go_together(motion: dict[str, Any], words: list[str]) -> None:
+def test_values_that_do_not_go_together(motion, words):
     refusal(lambda: posed(**motion), "test.toml", *words)
 
 
@@ -167,7 +163,7 @@ DWELL = "t,x,y\n0,-0.4,0.1\n0.18,0.3,0.2\n0.22,0.3,0.2\n0.4,0.5,0.6\n"
 
 
 @EVERY
-def test_equal_rows_are_a_stop(tmp_path: Path, name: str) -> None:
+def test_equal_rows_are_a_stop(tmp_path, name):
     """At the point to rounding, without speed and acceleration; rest to rest on both sides."""
     file = tmp_path / "pick.csv"
     file.write_text(DWELL)
@@ -193,7 +189,7 @@ def test_equal_rows_are_a_stop(tmp_path: Path, name: str) -> None:
     check_motion(of)
 
 
-def test_limits_in_a_table_with_stops(tmp_path: Path) -> None:
+def test_limits_in_a_table_with_stops(tmp_path):
     """Each move has the time that the table gives it: too little is named by file and line."""
     file = tmp_path / "pick.csv"
     file.write_text(DWELL)
@@ -211,19 +207,19 @@ ROWS = np.array([[0.0, 0.0], [0.3, 0.4], [1.1, 0.3], [1.0, -0.2], [1.6, -0.3]])
 TIMES = np.array([0.0, 0.3, 0.8, 1.1, 1.9])  # s
 
 
-def written(folder: Path, text: str) -> str:
+def written(folder, text):
     """Return the path of a table with this content."""
     path = folder / "table.csv"
     path.write_text(text, encoding="utf-8")
     return str(path)
 
 
-def table(t: np.ndarray | None = None, rows: np.ndarray = ROWS) -> Table:
+def table(t=None, rows=ROWS):
     """Return a table that was not read from a file."""
     return Table("table.csv", tuple(range(2, 2 + len(rows))), t, rows)
 
 
-def test_columns_in_any_order_comments_blank_lines_and_spreadsheets(tmp_path: Path) -> None:
+def test_columns_in_any_order_comments_blank_lines_and_spreadsheets(tmp_path):
     """Values are those of the columns asked for; lines are those of the file."""
     text = '\ufeff# a path\n\n"y", t ,x\r\n  # from here\n2, 0, 1\n\n-4e-1,.5,3\n'
     found = read_table(written(tmp_path, text), ("x", "y"))
@@ -235,7 +231,7 @@ def test_columns_in_any_order_comments_blank_lines_and_spreadsheets(tmp_path: Pa
 
 
 @pytest.mark.parametrize("separator", [";", "\t", " ; "])
-def test_decimal_commas(tmp_path: Path, separator: str) -> None:
+def test_decimal_commas(tmp_path, separator):
     """As spreadsheets write tables where numbers have commas; points are read, too."""
     text = "t|x|y\n0|1,5|2\n0,5|-4.25|1e-1\n".replace("|", separator)
     found = read_table(written(tmp_path, text), ("x", "y"))
@@ -267,14 +263,14 @@ def test_decimal_commas(tmp_path: Path, separator: str) -> None:
         (b"x,y\n# L\xe4nge\n", ["line 2", "UTF-8"]),
     ],
 )
-def test_bad_table(tmp_path: Path, text: str | bytes, words: list[str]) -> None:
+def test_bad_table(tmp_path, text, words):
     """One line that names the file, the line, the column and the value."""
     file = tmp_path / "table.csv"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     refusal(lambda: read_table(str(file), ("x", "y")), f"{file}: ", *words)
 
 
-def test_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_file_that_cannot_be_read(tmp_path):
     for file, reason in (
         (str(tmp_path), "Is a directory"),
         (str(tmp_path / "absent.csv"), "No such file"),
@@ -285,7 +281,7 @@ def test_file_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("same", [1, 4])
-def test_repeated_rows_have_no_chord(same: int) -> None:
+def test_repeated_rows_have_no_chord(same):
     """Without times only: with them the end-effector waits."""
     rows = ROWS.copy()
     rows[same] = rows[same - 1]
@@ -293,7 +289,7 @@ def test_repeated_rows_have_no_chord(same: int) -> None:
     assert_close(curve_in_time(table(TIMES, rows))(TIMES)[0][same], rows[same], 1e-13, 1.0)
 
 
-def test_two_rows_in_time_are_the_quintic_law() -> None:
+def test_two_rows_in_time_are_the_quintic_law():
     """Degree 5 with rest at both ends is 10 u^3 - 15 u^4 + 6 u^5."""
     curve = curve_in_time(table(np.array([0.0, 2.0]), np.array([[1.0], [4.0]])))
     u = np.linspace(0.0, 1.0, 11)

@@ -36,7 +36,6 @@ from dolfinopt.multibody.rotations import roll_pitch_yaw, skew
 from dolfinopt.multibody.tangent import linearise
 from dolfinopt.multibody.tree import (
     AppliedForce,
-    Mechanism,
 )
 from dolfinopt.scene.load import read_scene
 
@@ -54,10 +53,10 @@ class Machine:
     states: np.ndarray
 
     @property
-    def rigid(self) -> int:
+    def rigid(self):
         return self.mechanism.num_rigid + len(self.mechanism.motor_joints)
 
-    def split(self, states: np.ndarray) -> tuple[RigidMotion, list[np.ndarray]]:
+    def split(self, states):
         """Return rigid motion and elastic coordinates with rates."""
         forces, (count, b) = self.mechanism.forces, (states.shape[1], self.mechanism.dim.b)
         motion = RigidMotion(*states[:, :, : self.mechanism.num_rigid])
@@ -68,25 +67,25 @@ class Machine:
             motion = replace(motion, applied=values)
         return motion, list(states[:, :, self.rigid :])
 
-    def forces(self, states: np.ndarray, mechanism: Any = None) -> np.ndarray:
+    def forces(self, states, mechanism=None):
         """Return the forces of rigid and elastic coordinates (n, S)."""
         motion, rates = self.split(states)
         rows, drives = inverse_dynamics(mechanism or self.mechanism, motion, *rates)
         return np.hstack([drives, rows])
 
-    def tangent(self, keep: Any = None, rigid: Any = None, part: slice = slice(None)) -> Any:
+    def tangent(self, keep=None, rigid=None, part=slice(None)):
         motion, rates = self.split(self.states[:, part])
         return linearise(self.mechanism, motion, *rates, keep, rigid)
 
 
-def given(mechanism: Mechanism) -> tuple[AppliedForce, ...]:
+def given(mechanism):
     """Return forces of the world and the arm on every interface, two together at the end."""
     every = [(i, s) for i, c in enumerate(mechanism.constants) for s in range(len(c.points))]
     sites = [mechanism.end, *every]
     return tuple(AppliedForce(site, k, in_world=k % 2 == 0) for k, site in enumerate(sites))
 
 
-def machine_of(kind: str, count: int = 4) -> Machine:
+def machine_of(kind, count=4):
     if kind.endswith(PUSHED):
         one = machine_of(kind.removesuffix(PUSHED), count)
         return replace(one, mechanism=replace(one.mechanism, forces=given(one.mechanism)))
@@ -113,13 +112,13 @@ FACTORED = "3 arms of many"
 
 
 @pytest.fixture(scope="module", params=KINDS)
-def machine(request) -> Machine:
+def machine(request):
     return machine_of(request.param)
 
 
 @pytest.mark.serial
 @pytest.mark.parametrize("kind", ["1 arm", "2 arms", "3 arms", "tree"])
-def test_forces_are_those_of_the_points(kind: str) -> None:
+def test_forces_are_those_of_the_points(kind):
     """Newton's law for every point."""
     one = machine_of(kind, 3)
     found = one.forces(one.states)
@@ -134,7 +133,7 @@ def test_forces_are_those_of_the_points(kind: str) -> None:
 @pytest.mark.serial
 @pytest.mark.parametrize("in_world", [True, False])
 @pytest.mark.parametrize("kind", ["3 arms", "3 arms, stiffened", "tree, stiffened"])
-def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
+def test_given_force_does_virtual_work(kind, in_world):
     """On every coordinate what the end-effector's virtual displacement and rotation ask for."""
     one = machine_of(kind)
     pushed = replace(one.mechanism, forces=(AppliedForce(one.mechanism.end, 0, in_world),))
@@ -155,7 +154,7 @@ def test_given_force_does_virtual_work(kind: str, in_world: bool) -> None:
 
 @pytest.mark.serial
 @pytest.mark.parametrize("kind", [*KINDS, FACTORED, FACTORED + PUSHED])
-def test_tangent_is_the_derivative_of_the_forces(kind: str) -> None:
+def test_tangent_is_the_derivative_of_the_forces(kind):
     """Dense, by parts and from both sides, whatever rigid and elastic coordinates are asked for."""
     machine = machine_of(kind)
     states, R = machine.states, machine.rigid
@@ -191,7 +190,7 @@ def test_tangent_is_the_derivative_of_the_forces(kind: str) -> None:
 
 @pytest.mark.serial
 @pytest.mark.parametrize("name", CONSTANTS)
-def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
+def test_gradient_by_the_bodies(machine, name):
     """Virtual work of rows and drives by every integral of every body."""
     states, rng = machine.states, np.random.default_rng(5)
     weights = rng.normal(size=states.shape[1:])
@@ -201,7 +200,7 @@ def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
     for i, body in enumerate(machine.mechanism.bodies):
         change = change_of(rng, body, name)
 
-        def work(h: float, i: int = i, change: np.ndarray = change) -> float:
+        def work(h, i=i, change=change):
             moved = changed(machine.mechanism, i, name, h * change)
             return float(np.sum(weights * machine.forces(states, moved)))
 
@@ -210,7 +209,7 @@ def test_gradient_by_the_bodies(machine: Machine, name: str) -> None:
 
 
 @pytest.mark.serial
-def test_end_effector(machine: Machine) -> None:
+def test_end_effector(machine):
     """Its place, its turn, and derivatives by all they depend on."""
     mechanism, rng = machine.mechanism, np.random.default_rng(9)
     motion, (q, _, _) = machine.split(machine.states)
@@ -223,11 +222,11 @@ def test_end_effector(machine: Machine) -> None:
     by_q, by_rigid, by_bodies = end_effector_gradient(mechanism, motion, q, weights, turned)
     step, turn = rng.normal(size=q.shape), rng.normal(size=motion.q.shape)
 
-    def worth(one: Any, moved: RigidMotion, q: np.ndarray) -> float:
+    def worth(one, moved, q):
         squares = end_rotation(one, moved, q, motion) ** 2
         return float(np.sum(weights * end_effector(one, moved, q)) + 0.5 * squares.sum())
 
-    def along(h: float) -> float:
+    def along(h):
         moved = replace(motion, q=motion.q + h * turn)
         return worth(mechanism, moved, q + h * step)
 
@@ -239,14 +238,14 @@ def test_end_effector(machine: Machine) -> None:
         for name, gradient in by_bodies[i].items():
             change = change_of(rng, body, name)
 
-            def moved(h: float, i: int = i, name: str = name, x: np.ndarray = change) -> float:
+            def moved(h, i=i, name=name, x=change):
                 return worth(changed(mechanism, i, name, h * x), motion, q)
 
             assert_close(np.sum(gradient * change), derivative(moved), DIFFERENCES, 10.0)
 
 
 @pytest.mark.serial
-def test_few_instants_do_not_depend_on_memory() -> None:
+def test_few_instants_do_not_depend_on_memory():
     """The same bits wherever the arrays lie; NumPy 1.24 multiplies short complex arrays two ways.
 
     Arrays of all small sizes that come and go make the allocator choose other places every time.

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +12,9 @@ from mpi4py import MPI
 from PIL import Image
 
 import dolfinopt as do
-from dolfinopt.multibody.closures import Loops, Tie
+from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots import curves, design, machine
@@ -29,7 +26,7 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 LENGTHS = (1.0, 0.7, 0.4)  # m
 
 
-def beam(name: str, length: float, height: float, nx: int, ny: int) -> ArmView:
+def beam(name, length, height, nx, ny):
     """Return rectangles, solid above the axis, with modes u = (x, 0) and u = (-2 x y, x^2)."""
     x = np.linspace(0.0, length, nx + 1)
     y = np.linspace(-0.5 * height, 0.5 * height, ny + 1)
@@ -43,7 +40,7 @@ def beam(name: str, length: float, height: float, nx: int, ny: int) -> ArmView:
     return ArmView(name, corners, centroid, density, np.stack([stretch, bend], axis=-1))
 
 
-def body(outboard: np.ndarray, length: float) -> ShapeIntegrals:
+def body(outboard, length):
     """Return a body of which only what places it in the plane has a meaning."""
     q = outboard.shape[1]
     none = np.zeros((q, q))
@@ -54,18 +51,18 @@ def body(outboard: np.ndarray, length: float) -> ShapeIntegrals:
     )  # fmt: skip
 
 
-def beam_body(length: float) -> ShapeIntegrals:
+def beam_body(length):
     return body(np.array([[length, 0.0], [0.0, length**2], [0.0, 2.0 * length]]), length)
 
 
-def manipulator(arms: int) -> tuple[list[ArmView], Mechanism]:
+def manipulator(arms):
     lengths = LENGTHS[:arms]
     views = [beam(f"arm{k}", length, 0.06, 20, 4) for k, length in enumerate(lengths)]
     bodies = tuple(beam_body(length) for length in lengths)
     return views, plane_chain(bodies, 6.0, 0.0, (0.0, 0.0), joint_height=-0.5)
 
 
-def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Tie | None = None) -> Any:
+def motion(mechanism, t, q_r, q_e, desired=None, closure=None):
     """Return what pictures ask of a trajectory."""
     end = end_effector(mechanism, still(q_r), q_e)
     return SimpleNamespace(
@@ -75,7 +72,7 @@ def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Tie | None 
     )  # fmt: skip
 
 
-def swinging(mechanism: Mechanism) -> Any:
+def swinging(mechanism):
     """Return a motion; the deviation is some centimetres."""
     arms = len(mechanism.bodies)
     t = np.linspace(0.0, 2.0, 41)
@@ -83,11 +80,11 @@ def swinging(mechanism: Mechanism) -> Any:
     return motion(mechanism, t, q_r, 0.01 * np.sin(np.outer(t, 2.0 + np.arange(2 * arms))))
 
 
-def still(q: np.ndarray) -> RigidMotion:
+def still(q):
     return RigidMotion(q, np.zeros_like(q), np.zeros_like(q))
 
 
-def shown(figure) -> np.ndarray:
+def shown(figure):
     """Return a figure's pixels (height, width, 3); nothing may be beyond its edges, nor blank."""
     figure.canvas.draw()
     box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
@@ -193,7 +190,7 @@ def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
         shown(curves.deviation_figure(t, deviation, 1.3 * deviation))
 
 
-def cells_of(axes) -> list[PathCollection]:
+def cells_of(axes):
     return [each for each in axes.collections if isinstance(each, PathCollection)]
 
 

@@ -1,7 +1,5 @@
 """Reduced bases against dense eigenproblems, full solves and beam theory."""
 
-from __future__ import annotations
-
 import dataclasses
 import gc
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Buckling: Euler's and Greenhill's columns, void that does not buckle, worst instants, limits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from machines import held_link
@@ -45,14 +43,14 @@ def bar(tmp_path_factory):
     return arm.current, young * THICKNESS * HEIGHT**3 / 12.0
 
 
-def under(state, load: int, size: float, modulus: StressedModulus | None = None) -> Prestress:
+def under(state, load, size, modulus=None):
     """Return the stress of a unit load times a size."""
     a = np.zeros((1, state.load_fields.columns.shape[2]))
     a[0, state.basis.V.shape[2] + load] = size
     return Prestress(state.load_fields, modulus or stressed_modulus(state), a)
 
 
-def factor_of(state, load: int, size: float) -> float:
+def factor_of(state, load, size):
     return 1.0 / buckling_modes(under(state, load, size), 1).inverse[0]
 
 
@@ -90,7 +88,7 @@ def test_void_in_a_closing_gap_does_not_buckle():
     row = np.round((y - y.min()) / (y.max() - y.min()) * 11).astype(int)
     solid = (row >= 8) | ((row >= 2) & (row <= 6) & (x < 0.9)) | (x < 0.02)
 
-    def first(light: float, modulus: StressedModulus | None = None) -> tuple[float, float]:
+    def first(light, modulus=None):
         """Return the factor, and the share of the mode's energy in solid."""
         arm.state(np.where(solid, 1.0, light))
         one = arm.current
@@ -134,7 +132,7 @@ SECTION = {"height": 0.04, "thickness": 0.02}
 CELLS = {"plane": [30, 6], "space": [20, 2, 2]}
 
 
-def column(kind: str, folder, *changes: str) -> do.Scene:
+def column(kind, folder, *changes):
     """Return a cantilever under a mass that presses it along its axis, held still."""
     gravity = [-GRAVITY] + [0.0] * (len(CELLS[kind]) - 1)
     tables = {"payload": {"mass": MASS}, "simulation": {"stiffening": False}}
@@ -165,7 +163,7 @@ def test_an_arm_cut_in_two(monkeypatch):
             "arms.passive=0", "design.filter_radius=0")  # fmt: skip
     one = do.load_scene(build().scene.source, ("arms.cells=[20,3]", *told))
 
-    def factor(world: MPI.Comm) -> float:
+    def factor(world):
         built = built_of(one, world)
         return built.evaluate(built.fields(wave))[0].responses[0].values[0]
 

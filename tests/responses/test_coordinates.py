@@ -1,7 +1,5 @@
 """The choice of coordinates: what the estimate is worth, and that every use of a scene keeps it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -17,33 +15,33 @@ from dolfinopt.dynamics.build import simulate
 from dolfinopt.optimization import assessment, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.responses import order_selection as coordinates
-from dolfinopt.responses.order_selection import Comparison, OrderSelection
+from dolfinopt.responses.order_selection import Comparison
 
 WORLD = MPI.COMM_WORLD
 AUTO = 'reduction.coordinates="auto"'
 SHORT = "motion.horizon=1.9"
 
 
-def auto(*overrides: str, tolerance: float = 1e-2, cells: tuple[int, int] = (24, 3)) -> Built:
+def auto(*overrides, tolerance=1e-2, cells=(24, 3)):
     linear = "simulation.stiffening=false"  # what is estimated here is the number of modes alone
     reduced = f"reduction.tolerance={tolerance}"
     return build(AUTO, reduced, SHORT, linear, *overrides, cells=cells)
 
 
-def error(built: Built, x: dict[int, np.ndarray], count: int) -> float:
+def error(built, x, count):
     return Comparison(*built.place, x, built.profile).error(count)
 
 
-def choose(built: Built, x: dict[int, np.ndarray]) -> OrderSelection:
+def choose(built, x):
     choice = do.choose_coordinates(built.scene, built.partition, built.arms, x, built.profile)
     assert choice is not None
     return choice
 
 
-def clouds(seed: int, crisp: bool):
+def clouds(seed, crisp):
     """Return smooth random densities in [0.1, 1], or void and solid, as a function of place."""
 
-    def field(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def field(k, x, y):
         rng = np.random.default_rng([seed, k])
         total = np.zeros_like(x)
         for _ in range(12):
@@ -70,7 +68,7 @@ CELLS = (30, 4)
 SHAKEN = ("damping.stiffness_proportional=1e-5", "payload.mass=2", "motion.duration=1.2")
 
 
-def moved(built: Built, count: int, method: str):
+def moved(built, count, method):
     """Return scene and arms by a number of coordinates, to be integrated more finely."""
     data = built.scene.to_dict()
     data["reduction"] |= {"coordinates": count, "tolerance": 1e-3, "method": method}
@@ -165,7 +163,7 @@ def test_unresolved():
             arm.reduce(built.fields(wave)[k])
 
 
-def small(*overrides: str, iterations: int = 3):
+def small(*overrides, iterations=3):
     settings = ["arms.cells=[24,3]", "motion.horizon=1.9", f"optimizer.max_iterations={iterations}"]
     return do.load_scene(TWO_ARM, (*settings, "reduction.tolerance=0.01", AUTO, *overrides))
 
@@ -227,7 +225,7 @@ def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
 def test_commands(tmp_path, capsys):
     """Each says what it chose; a picture drawn anew takes the number from the summary."""
 
-    def said(*words: object) -> str:
+    def said(*words):
         run(*words, *overrides("arms.cells=[24,3]", AUTO))
         return capsys.readouterr().out
 

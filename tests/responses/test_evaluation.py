@@ -1,7 +1,5 @@
 """One pass down the street: shared designs, rigid arms, own materials, frozen loads, the cost."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import fields
 
@@ -16,7 +14,7 @@ from dolfinopt.responses.evaluation import constraint_gradients
 from dolfinopt.responses.motion import motion_objective
 
 
-def same(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def same(k, x, y):
     """Return the same design on every arm."""
     return wave(0, x, y)
 
@@ -36,7 +34,7 @@ CASES = [
 
 @pytest.mark.serial  # ranks: test_every_option_gives_the_same_bits_on_any_number_of_ranks
 @pytest.mark.parametrize("overrides", CASES, ids=" ".join)
-def test_a_shared_design_is_two_equal_ones(overrides: list[str]) -> None:
+def test_a_shared_design_is_two_equal_ones(overrides):
     """The same figures, and the sum of both gradients; the work is counted in test_skip."""
     found = []
     for sharing in ([], [SHARED]):
@@ -62,12 +60,12 @@ RESULTS = "objective", "max_deviation"
 
 
 @pytest.mark.serial  # ranks have no part in it
-def test_a_rigid_arm_is_the_limit_of_stiff_ones() -> None:
+def test_a_rigid_arm_is_the_limit_of_stiff_ones():
     """The solid arm beside its stiffer and stiffer twin: the difference falls as 1 / E."""
     quick = ["motion.horizon=2.0", "arms.arm2.young_modulus=70e9", "simulation.tolerance=1e-6"]
     quick += ["simulation.stiffening=false"]  # the other arm bends as far as in the limit
 
-    def solid(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def solid(k, x, y):
         return np.ones(len(x)) if k == 0 else same(k, x, y)
 
     rigid = build("arms.arm1.rigid=true", *quick)
@@ -87,7 +85,7 @@ def test_a_rigid_arm_is_the_limit_of_stiff_ones() -> None:
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("overrides", [[], [SHARED], ["arms.arm1.rigid=true"]], ids=str)
 @pytest.mark.parametrize("kind", ["esl", "integral_compliance", "deviation"])
-def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: list[str]) -> None:
+def test_frozen_gradient_is_that_of_the_frozen_problem(kind, overrides):
     """Loads f_j = K q_j, modes and instants held: q_j(x) = (V' K(x) V)^-1 f_j, remainders of 2."""
     built = build(f"objective.kind={kind}", "payload.mass=1.0", *overrides)
     x = built.fields(wave)
@@ -95,7 +93,7 @@ def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: lis
     slopes, where = built.gradient(base), motion_objective(base).load_cases(base)
     bases = {k: arm.basis for k, arm in built.arms.items()}
 
-    def value(h: float, d) -> float:
+    def value(h, d):
         q, total = base.q_e.copy(), 0.0
         parts = zip(base.mechanism.slices, base.mechanism.bodies, built.scene.owners)
         for part, body, owner in parts:
@@ -125,20 +123,20 @@ def test_frozen_gradient_is_that_of_the_frozen_problem(kind: str, overrides: lis
 
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize(("kind", "designs"), [("heaviside", 1), ("robust", 3)])
-def test_gradient_by_the_variables_through_a_projection(kind: str, designs: int) -> None:
+def test_gradient_by_the_variables_through_a_projection(kind, designs):
     """Symmetry, filter, projection and solid ends: remainders of every design x stands for."""
     keys = "design.filter_radius=0.05", "arms.passive=0.1", "arms.symmetric=true"
     built = build("objective.kind=static", f"design.projection={kind}", *keys, cells=(24, 4))
     x, d, arms = built.fields(wave), built.fields(uneven), built.arms
 
-    def realised(h: float, variant: int):
+    def realised(h, variant):
         moved = {k: arm.physical_designs(x[k] + h * d[k], 4.0) for k, arm in arms.items()}
         return {k: found[variant] for k, found in moved.items()}
 
     values = []
     for variant in range(designs):
 
-        def value(h: float, variant: int = variant) -> float:
+        def value(h, variant=variant):
             x_phys = {k: one.x_phys for k, one in realised(h, variant).items()}
             return built.evaluate(x_phys)[0].objective
 
@@ -154,7 +152,7 @@ def test_gradient_by_the_variables_through_a_projection(kind: str, designs: int)
 
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("worst", ["compliance", "deviation"])
-def test_load_cases_are_the_worst_instants(worst: str) -> None:
+def test_load_cases_are_the_worst_instants(worst):
     """One an interval, found by going through all samples; the objective sums their compliance."""
     built = build(f"objective.worst={worst}", "objective.load_cases=7")
     evaluation, trajectory = built.evaluate(built.fields(wave))
@@ -174,7 +172,7 @@ def test_load_cases_are_the_worst_instants(worst: str) -> None:
 
 
 @pytest.mark.serial  # ranks have no part in it
-def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None:
+def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed():
     """An arm set on a mode that is not the lowest: the objective follows it, the bound does not."""
     limit = "constraints.first_frequency=1.0"
     built = build("objective.kind=eigenfrequency", "objective.follow=true", limit)
@@ -188,7 +186,7 @@ def test_the_frequency_bound_is_of_the_first_mode_whatever_is_followed() -> None
     np.testing.assert_allclose(second.constraints, first.constraints, rtol=1e-9)
 
 
-def with_third(value: float):
+def with_third(value):
     return lambda x: np.where(np.arange(len(x)) == 3, value, x)
 
 
@@ -203,7 +201,7 @@ def with_third(value: float):
     ],
     ids=["negative", "above one", "nan", "too few", "columns"],
 )
-def test_densities_that_are_none_are_refused(change, words) -> None:
+def test_densities_that_are_none_are_refused(change, words):
     """On all ranks, although one alone has them."""
     built = build()
     x = built.fields(same)
@@ -236,7 +234,7 @@ def seen(scene_file, *overrides):
 
 @pytest.mark.serial  # the instants belong to the root
 @pytest.mark.parametrize("name", MOTIONS)
-def test_no_result_depends_on_the_interval_of_the_files(name: str) -> None:
+def test_no_result_depends_on_the_interval_of_the_files(name):
     """Values and gradients of every response to the bit, with two output instants and with many."""
     file, quick, asked = MOTIONS[name]
     found = []
@@ -252,7 +250,7 @@ def test_no_result_depends_on_the_interval_of_the_files(name: str) -> None:
 
 
 @pytest.mark.serial  # the trajectory belongs to one rank
-def test_extremes_and_load_cases_look_every_millisecond_and_at_the_end() -> None:
+def test_extremes_and_load_cases_look_every_millisecond_and_at_the_end():
     """By the definition, from the integrator's interpolant, on a horizon of no whole number."""
     overrides = ["arms.cells=[12,2]", "motion.duration=1.9003", "motion.horizon=1.9003"]
     overrides += ["simulation.sample=0.7", "objective.load_cases=7"]

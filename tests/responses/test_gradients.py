@@ -4,10 +4,6 @@ Remainders are of second order along random directions. The reference is the who
 densities that are changed, and on meshes whose nodes are moved.
 """
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from loops import BOOM_TABLE, SOFT, bennett, boom, closed, four_bar
@@ -70,7 +66,7 @@ CLOSED = {
 }
 
 
-def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
+def scene_of(base, changes, folder):
     """Return a scene with keys changed, FOLDER standing for the files' one (collective)."""
     by_root(lambda: [(folder / file).write_text(text) for file, text in FILES.items()])
     if base in CLOSED:
@@ -81,7 +77,7 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
     return demo_machine(name, (*quick, *changes), folder, one_arm=base == "one_arm")
 
 
-def case(base: str, kind: str, *changes: str, ranks: bool = False, slow: bool = False):
+def case(base, kind, *changes, ranks=False, slow=False):
     """Return a case: base, objective ("": the base's own) and keys."""
     lightest = kind in ("mass", "effort", "peak_force")
     kept = ["constraints.compliance=1e6"] * lightest  # N m; far away
@@ -334,7 +330,7 @@ CASES = [
 ]  # fmt: skip
 
 
-def contract(base: str, changes: tuple[str, ...], folder: Path, patch) -> do.Scene:
+def contract(base, changes, folder, patch):
     """Return the scene, whose stress and buckling look at what they look at, come what may."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
     patch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
@@ -343,7 +339,7 @@ def contract(base: str, changes: tuple[str, ...], folder: Path, patch) -> do.Sce
 
 
 @pytest.mark.parametrize(("base", "changes"), CASES)
-def test_by_densities(base, changes, shared_tmp_path, monkeypatch) -> None:
+def test_by_densities(base, changes, shared_tmp_path, monkeypatch):
     """Along a random and a smooth direction; the gradient by ESL points the same way."""
     scene = contract(base, changes, shared_tmp_path, monkeypatch)
     kind = scene.objective.kind
@@ -380,7 +376,7 @@ LIMITS = [
 
 
 @pytest.mark.parametrize(("base", "changes"), LIMITS)
-def test_limits_by_densities(base, changes, shared_tmp_path) -> None:
+def test_limits_by_densities(base, changes, shared_tmp_path):
     """Of every value that is limited, over its limit."""
     scene = scene_of(base, changes, shared_tmp_path)
     # Of a motion by steps at which what is left of the time error stays below the remainders.
@@ -433,7 +429,7 @@ NODES = [
 
 
 @pytest.mark.parametrize(("base", "changes"), NODES)
-def test_by_nodes(base, changes, shared_tmp_path, monkeypatch) -> None:
+def test_by_nodes(base, changes, shared_tmp_path, monkeypatch):
     """Along random moves of all nodes of uneven meshes, those of interfaces included."""
     monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)  # one arm on two ranks is cut in two
     scene = contract(base, changes, shared_tmp_path, monkeypatch)

@@ -1,9 +1,6 @@
 """Kinds of responses against closed forms: effort of drives, settling, orientation, stiffness."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +23,7 @@ KEPT = "constraints.compliance=1e6"  # N m; far away
 SMALL = ("arms.cells=[20,3]", EFFORT, KEPT)
 
 
-def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
+def point_mass_forces(t, mass, gravity):
     """Return the forces (n, 3) of cart, shoulder and elbow that move a point mass on the arc."""
     # Newton's law of the payload alone: arms of 1 m without mass hand its force on.
     s, sd, sdd = QUINTIC(t, 1.9)
@@ -43,7 +40,7 @@ def point_mass_forces(t: np.ndarray, mass: float, gravity: float) -> np.ndarray:
 @pytest.mark.serial
 @pytest.mark.parametrize("weights", [None, (0.01, 0.02, 0.05), (0.0, 0.0, 1.0)])
 @pytest.mark.parametrize("gravity", [0.0, 9.81])
-def test_rigid_limit_is_newtons_law(gravity, weights) -> None:
+def test_rigid_limit_is_newtons_law(gravity, weights):
     """Stiff arms of hardly any mass: the payload's inertia is all that the drives feel."""
     changes = [f"motion.gravity=[0.0, {-gravity}]", "material.density=1e-3"]
     changes += ["material.young_modulus=1e14", "simulation.stiffening=false"]
@@ -57,7 +54,7 @@ def test_rigid_limit_is_newtons_law(gravity, weights) -> None:
 
 
 @pytest.mark.serial
-def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
+def test_it_is_the_drives_root_mean_square_of_the_summary():
     """Weighted; of a fixed base the joints' alone."""
     for changes in ((), ("motion.base=fixed", "motion.radius=0.6")):
         made = scene(*SMALL, *changes)
@@ -69,7 +66,7 @@ def test_it_is_the_drives_root_mean_square_of_the_summary() -> None:
 
 
 @pytest.mark.serial
-def test_peak_forces_are_limited_drive_by_drive() -> None:
+def test_peak_forces_are_limited_drive_by_drive():
     """The true values are the largest samples; smooth ones and weights only lead there."""
     limits = "constraints.peak_force=[20.0,30.0,10.0]"
     weighted = ["objective.effort_weights=[0.0,2.0,1.0]", "constraints.effort=100.0"]
@@ -91,7 +88,7 @@ def test_peak_forces_are_limited_drive_by_drive() -> None:
 
 
 @pytest.mark.serial
-def test_a_drive_may_have_no_limit() -> None:
+def test_a_drive_may_have_no_limit():
     """As inf in a scene, and null in a summary's, which is read back."""
     made = scene("arms.cells=[20,3]", "constraints.peak_force=[inf,30.0,inf]")
     result = Model(made).simulate()
@@ -104,7 +101,7 @@ def test_a_drive_may_have_no_limit() -> None:
 
 
 @pytest.mark.serial
-def test_weighted_sum_of_peak_forces_as_objective() -> None:
+def test_weighted_sum_of_peak_forces_as_objective():
     """Each p-mean times its weight; a large exponent brings it to the peaks."""
     weights = np.array([0.0, 2.0, 1.0])
     options = ["objective.effort_weights=[0.0,2.0,1.0]", "objective.exponent=200", KEPT]
@@ -114,7 +111,7 @@ def test_weighted_sum_of_peak_forces_as_objective() -> None:
 
 
 @pytest.mark.serial
-def test_effort_demo(tmp_path: Path) -> None:
+def test_effort_demo(tmp_path):
     """Runs, tables and draws on few cells."""
     rows = demo("demo_effort").main(tmp_path, (20, 2), 3)
     assert [row["design"] for row in rows] == ["least compliance", "least effort"]
@@ -124,7 +121,7 @@ def test_effort_demo(tmp_path: Path) -> None:
 
 
 @pytest.mark.serial
-def test_the_gradient_is_exact_whatever_is_asked_for() -> None:
+def test_the_gradient_is_exact_whatever_is_asked_for():
     """Frozen loads tell nothing of forces that come from mass."""
     model = Model(scene(*SMALL, "motion.horizon=2.2"))
     frozen, exact = (model.gradient(kind=kind) for kind in ("esl", "exact"))
@@ -225,7 +222,7 @@ LINKS = {
 }
 
 
-def machine(kind: str, folder, *changes: str) -> do.Scene:
+def machine(kind, folder, *changes):
     """Return a solid cantilever of no weight with a payload, held still."""
     gravity = [0.0, -GRAVITY] + [0.0] * (kind == "space")
     return held_link(folder, LINKS[kind], gravity, changes, payload={"mass": MASS})
@@ -256,7 +253,7 @@ def test_cantilever_under_its_payload(kind, controlled, tmp_path):
 
 @pytest.mark.serial
 @pytest.mark.parametrize("dim", [2, 3])
-def test_timoshenkos_cantilever(dim, tmp_path) -> None:
+def test_timoshenkos_cantilever(dim, tmp_path):
     """u = F L^3 / (3 EI) + F L / (k G A) + M L^2 / (2 EI), theta = F L^2 / (2 EI) + M L / EI."""
     L, b, h, E, nu, F, M = 1.0, 0.02, 0.1, 70e9, 0.3, 100.0, 20.0
     inertia, area = b * h**3 / 12.0, b * h

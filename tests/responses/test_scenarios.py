@@ -1,7 +1,5 @@
 """One design under several scenarios: bodies, objectives and gradients."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

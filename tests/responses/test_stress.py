@@ -1,24 +1,17 @@
 """Stress along the motion: against the full model, by finite differences, and as a limit."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import Built, build, built_of, wave
+from remainders import build, built_of, wave
 from runs import TWO_ARM
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm
-from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.load_gradient import ProbedSystem
 from dolfinopt.fem.stress import places_of, stress_operator
 from dolfinopt.multibody.newton_euler import outward_pass
-from dolfinopt.responses.response import Analysis, CellGradient, Measured, find
+from dolfinopt.responses.response import Analysis, find
 from dolfinopt.responses.stress import (
-    CellStress,
     arm_loads,
     cell_stress,
     maxima,
@@ -37,7 +30,7 @@ QUICK = ("motion.horizon=2.2", "simulation.tolerance=1e-7", "objective.gradient=
 class Analysed:
     """A design, analysed for its stress."""
 
-    def __init__(self, built: Built, x) -> None:
+    def __init__(self, built, x):
         _, self.trajectory = built.evaluate(x, simulated=True)
         designs = {k: arm.current for k, arm in built.arms.items()}
         self.analysis = Analysis(
@@ -45,10 +38,10 @@ class Analysed:
         )
         self.response = find("stress")(built.scene.objective)
 
-    def measure(self) -> Measured:
+    def measure(self):
         return self.response.measure(self.analysis)
 
-    def gradient(self) -> CellGradient:
+    def gradient(self):
         [row] = self.response.gradients(self.analysis)
         return row
 
@@ -70,14 +63,14 @@ def all_loads(arm, body, rates_at, outboard, n):
     return interior, end + outboard[:, None]
 
 
-def lengths(cells: CellStress, field: np.ndarray) -> np.ndarray:
+def lengths(cells, field):
     """Return the relaxed stress of a nodal field (n_nodes, 2)."""
     elastic = cells.fields.arm
     found = (elastic.substructure.stress_operator @ field.ravel()).reshape(3, -1)
     return ALUMINIUM * cells.root * np.linalg.norm(found, axis=0)
 
 
-def agree_with_rows(trajectory: Trajectory, tolerance: float) -> None:
+def agree_with_rows(trajectory, tolerance):
     """What loads the bodies is what the rows of coordinates say that never move."""
     probe = ProbedSystem(trajectory.problem)
     at = (probe.spread(x) for x in trajectory.unknowns)
@@ -88,13 +81,13 @@ def agree_with_rows(trajectory: Trajectory, tolerance: float) -> None:
 
 
 @pytest.mark.serial
-def test_both_ways_to_the_loads_agree() -> None:
+def test_both_ways_to_the_loads_agree():
     """From the passes of inverse dynamics, and from the rows of coordinates that never move."""
     built = build("simulation.stiffening=true", "motion.gravity=[0,-9.81]", "arms.joint_mass=0.3")
     agree_with_rows(Analysed(built, built.fields(wave)).trajectory, 1e-12)
 
 
-def analysed_arms(built: Built):
+def analysed_arms(built):
     """Yield every arm, its cells, c, q; stress by mode acceleration and loads at an instant."""
     trajectory = Analysed(built, built.fields(wave)).trajectory
     y, yd, ydd = trajectory.unknowns
@@ -105,10 +98,10 @@ def analysed_arms(built: Built):
         rates_at = y[:, part], yd[:, part], ydd[:, part]
         [loads] = arm_loads(built.scene, [trajectory])[k]
 
-        def found(n: int, cells=cells, loads=loads) -> np.ndarray:
+        def found(n, cells=cells, loads=loads):
             return np.linalg.norm(cells.A @ loads.coefficients[n], axis=0)
 
-        def right(n: int, arm=arm, body=links[k].body, rates_at=rates_at, c=c):
+        def right(n, arm=arm, body=links[k].body, rates_at=rates_at, c=c):
             return all_loads(arm, body, rates_at, c[n, 4:7], n)
 
         yield arm, cells, c, y[:, part], found, right
@@ -118,7 +111,7 @@ def analysed_arms(built: Built):
 @pytest.mark.slow
 @pytest.mark.parametrize("element", ["incompatible", "quadratic"])
 @pytest.mark.parametrize("method", ["craig-bampton", "modal"])
-def test_static_solution_of_all_loads(method: str, element: str) -> None:
+def test_static_solution_of_all_loads(method, element):
     """Without damping and stiffening mode acceleration is the full model's static solution."""
     # The loads are those of the frame's motion, put together node by node. Mode displacement misses
     # it by what the modes cannot show.
@@ -137,7 +130,7 @@ def test_static_solution_of_all_loads(method: str, element: str) -> None:
 
 
 @pytest.mark.serial
-def test_largest_of_all_samples_and_cells() -> None:
+def test_largest_of_all_samples_and_cells():
     """The true value is the largest of all, however few instants are looked at; so is the map."""
     built = build("simulation.sample=0.002")
     one = Analysed(built, built.fields(wave))
@@ -161,7 +154,7 @@ def test_largest_of_all_samples_and_cells() -> None:
 
 
 @pytest.mark.serial
-def test_cells_near_an_interface_may_be_left_out() -> None:
+def test_cells_near_an_interface_may_be_left_out():
     """The stress grows at the clamped corners; objective.stress_margin takes them out."""
     built = build("objective.stress_margin=0.1", cells=(40, 4))
     near = build(cells=(40, 4))
@@ -175,7 +168,7 @@ def test_cells_near_an_interface_may_be_left_out() -> None:
 
 
 @pytest.mark.serial
-def test_void_has_no_stress() -> None:
+def test_void_has_no_stress():
     """Nor an infinite derivative."""
     built = build(*QUICK)
     x = built.fields(lambda k, x, y: np.where((x > 0.4) & (x < 0.6) & (abs(y) < 0.02), 0.0, 1.0))
@@ -188,7 +181,7 @@ def test_void_has_no_stress() -> None:
 
 
 @pytest.mark.serial
-def test_stress_in_python() -> None:
+def test_stress_in_python():
     """Asked for, a simulation knows it and draws it; an optimisation knows it anyway."""
     model = do.Model(do.load_scene(TWO_ARM, ["arms.cells=[20,3]", "simulation.sample=0.01"]))
     plain, asked = model.simulate(), model.simulate(stress=True)
@@ -205,7 +198,7 @@ HEIGHT, THICKNESS, PAYLOAD = 0.06, 0.01, 1.0  # m, m, kg
 AREA, INERTIA = HEIGHT * THICKNESS, THICKNESS * HEIGHT**3 / 12.0  # m2, m4
 
 
-def turned(arm: dict[str, Any], speed: float, duration: float, damping: float):
+def turned(arm, speed, duration, damping):
     """Return a solid arm that spins up about its joint, and its motion."""
     motion = {"path": "rotation", "base": "fixed", "speed": speed, "duration": duration,
               "horizon": duration + 0.1}  # fmt: skip
@@ -224,7 +217,7 @@ def turned(arm: dict[str, Any], speed: float, duration: float, damping: float):
     return built.arms[0], trajectory
 
 
-def stress_at(arm: Arm, trajectory: Trajectory, points: np.ndarray, sample: int):
+def stress_at(arm, trajectory, points, sample):
     """Return places (k, 2), m, and stress (k,), Pa, at points of the reference cell."""
     state = arm.current
     operator = stress_operator(state.elastic.operators, points)
@@ -236,7 +229,7 @@ def stress_at(arm: Arm, trajectory: Trajectory, points: np.ndarray, sample: int)
 
 @pytest.mark.serial
 @pytest.mark.parametrize("when", [1.0, 1.3, 2.05])
-def test_beam(when: float) -> None:
+def test_beam(when):
     """M y / I and N / A of payload and the arm's own inertia, a height away from the root."""
     # At the clamped edge itself corners are singular. The motion takes long beside the vibration's
     # 80 ms; speeding up at 1 s, up and round at 1.3 s, round alone at 2.05 s, where Saint-Venant's
@@ -268,12 +261,12 @@ def test_beam(when: float) -> None:
 # -- the search for the largest stress misses nothing, and looks at few instants  -----------------
 
 
-def norms(A: np.ndarray, a: np.ndarray) -> np.ndarray:
+def norms(A, a):
     """Return |A_e a_n| (points, n)."""
     return np.sqrt(np.square(A @ a.T).sum(axis=0))
 
 
-def vibration(rng: np.random.Generator, n: int, m: int) -> np.ndarray:
+def vibration(rng, n, m):
     """Return coefficients of slow and fast vibrations that decay."""
     t = np.linspace(0.0, 1.0, n)[:, None]
     slow = np.sin(2.0 * np.pi * rng.uniform(0.5, 8.0, m) * t + rng.uniform(0.0, 6.0, m))
@@ -283,7 +276,7 @@ def vibration(rng: np.random.Generator, n: int, m: int) -> np.ndarray:
 
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("seed", range(12))
-def test_no_maximum_is_missed(seed: int) -> None:
+def test_no_maximum_is_missed(seed):
     """Against all points at all instants; with columns that cancel, and ones without stress."""
     rng = np.random.default_rng(seed)
     n, points, m = 901, 300, 9
@@ -307,12 +300,12 @@ def test_no_maximum_is_missed(seed: int) -> None:
     np.testing.assert_allclose(truth[np.arange(points), when], by_point, atol=2e-3 * truth.max())
 
 
-def test_nothing_is_loaded() -> None:
+def test_nothing_is_loaded():
     found = screen(MPI.COMM_SELF, np.zeros((3, 4, 2)), np.zeros((7, 2)))
     assert found.largest == 0.0
 
 
-def test_ranks_without_points() -> None:
+def test_ranks_without_points():
     """Ranks share the points, one has none; all know the largest, one has the point."""
     rng = np.random.default_rng(5)
     A, a = rng.normal(size=(3, 40, 4)), vibration(rng, 200, 4)

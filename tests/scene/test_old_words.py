@@ -30,7 +30,7 @@ ROBUST = ("design.projection=robust",)
         ((), "arms.arm2.pattern=arm1", "arms.arm2.design=arm1"),
     ],
 )
-def test_a_scene_in_older_words_is_that_in_those_of_now(used, old, new) -> None:
+def test_a_scene_in_older_words_is_that_in_those_of_now(used, old, new):
     duration = ["motion.duration=1.9"] if used is SHAPED else []
     older, newer = (read_scene(TWO_ARM, [*used, word, *duration]) for word in (old, new))
     assert older == newer and newer.old_words == ()

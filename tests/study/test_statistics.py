@@ -1,7 +1,5 @@
 """Distributions, samples, statistics and Sobol' indices against closed forms."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
