@@ -86,22 +86,6 @@ FORK = tuple(
 )
 
 
-def test_three_interfaces():
-    """Mirrored in y = 0 the two on the sides change places: their stiffness, too, to rounding."""
-    arm = solid_arm(cells=(10, 4, 2), coordinates=18, interfaces=FORK)
-    state = arm.state(arm.mesh.keep(np.full(arm.mesh.num_cells, 0.5)))
-    S, body = state.elastic.constraint_modes.stiffness, state.body
-    mirror = np.kron([[1, 0, 0], [0, 0, 1], [0, 1, 0]], np.diag([1, -1, 1, -1, 1, -1]))
-    assert np.abs(mirror @ S @ mirror.T - S).max() < 1e-12 * np.abs(S).max()
-    assert np.array_equal(body.outboard, np.eye(18)) and np.array_equal(body.K, S)
-    assert np.array_equal(body.points[:, 1], [0.0, 0.02, -0.02])
-    # Cells are solid around all of them; a design of solid ends alone joins the outboard one.
-    assert COMM.allreduce(int(arm.mesh.passive.sum())) == 8
-    ends = np.abs(arm.mesh.centroid[:, 0] - 0.25) > 0.1
-    assert arm.substructure.joins(np.ones(len(ends), dtype=bool))
-    assert not arm.substructure.joins(ends)
-
-
 @pytest.mark.parametrize("radius", [0.001, 0.3])
 def test_refused_interfaces(radius):
     """Of no side, and with nodes of another one: one line on all ranks."""

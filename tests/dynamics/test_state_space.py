@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from machines import controlled, loop_tree, trajectory_of, two_arm, with_keys
+from machines import controlled, loop_tree, trajectory_of, two_arm
 from runs import ROOT, refusal
 
 import dolfinopt as do
@@ -12,45 +12,6 @@ from dolfinopt.responses.linearised_machine import accurate_below
 from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial
-MODULUS, DENSITY, LENGTH, HEIGHT, THICKNESS = 70e9, 2700.0, 1.0, 0.02, 0.01
-
-
-def hanging(folder, gravity=9.81, **tables):
-    """Return a slender beam of solid material that hangs at rest from its joint."""
-    rows = f"t,arm\n0,{-0.5 * np.pi}\n0.1,{-0.5 * np.pi}\n"
-    (folder / "held.csv").write_text(rows)
-    tree = {
-        "material": {"young_modulus": MODULUS, "poisson_ratio": 0.0, "density": DENSITY},
-        "arms": [{"name": "arm", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS,
-                  "cells": [60, 3]}],
-        "motion": {"path": "joints", "file": "held.csv", "base": "fixed", "duration": 0.1,
-                   "horizon": 0.1, "gravity": [0.0, -gravity]},
-        "payload": {"mass": 0.0},
-        "damping": {"stiffness_proportional": 0.0},
-        "reduction": {"coordinates": 10},
-        "design": {"initial": 1.0, "volume_fraction": 1.0},
-    }  # fmt: skip
-    return trajectory_of(scene_from_dict(with_keys(tree, tables), str(folder / "held.toml")))
-
-
-def test_free_drive_leaves_a_pendulum(tmp_path):
-    """Its frequency sqrt(m g c / J), and the static compliance of joint and tip."""
-    found = state_space(hanging(tmp_path), 0.05)
-    mass = DENSITY * LENGTH * HEIGHT * THICKNESS
-    J = mass * (LENGTH**2 / 3.0 + HEIGHT**2 / 12.0)
-    exact = np.sqrt(0.5 * mass * 9.81 * LENGTH / J)
-    assert abs(found.poles[0]) == pytest.approx(exact, rel=1e-4)  # the beam bends by 1e-4
-    assert np.abs(found.poles.real).max() < 1e-6
-    assert found.states[:2] == ("arm", "arm q1") and len(found.states) == 22
-    assert found.inputs == ("arm", "tool fx", "tool fy", "tool mz")
-    gain = -found.C @ np.linalg.solve(found.A, found.B)
-    # A moment M turns it by M / (m g c); a force F at the tip, across, by F L / (m g c).
-    stiffness = 0.5 * mass * 9.81 * LENGTH
-    assert gain[0, :2] == pytest.approx([1.0 / stiffness, LENGTH / stiffness], rel=2e-3)
-    # Gravity bends it back along its length by twice the force: (1/3 - 2/8) F L^3 / E I.
-    bent = LENGTH**3 / (12.0 * MODULUS * THICKNESS * HEIGHT**3 / 12.0)
-    across = found.outputs.index("deflection x")
-    assert gain[across, 1] == pytest.approx(bent, rel=3e-3)
 
 
 def machine_at(trajectory, t):

@@ -8,9 +8,8 @@ from bodies import beam, plane_chain
 from machines import distance
 
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.collocation import radau_iia
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.tables import LoadedMotion, Table, stage_values_of
+from dolfinopt.dynamics.tables import LoadedMotion, Table
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.profiling import Profile
@@ -18,15 +17,6 @@ from dolfinopt.profiling import Profile
 pytestmark = pytest.mark.serial  # arrays of one process
 
 PULSE = np.array([0.5005, 0.5010, 0.5025, 0.5030])  # s, where it sets in, is up, falls, ends
-
-
-def test_a_polynomial_has_its_own_values():
-    """Of degree s - 1 the moments' polynomial is itself, whatever rows lie within the steps."""
-    c, grid = radau_iia(4).c, np.array([0.0, 0.3, 0.4, 1.0])
-    cubic = np.polynomial.Polynomial([1.0, -2.0, 3.0, 4.0])
-    found = stage_values_of(lambda t: cubic(t)[:, None], np.array([0.1, 0.11, 0.7]), grid, c)
-    t = (grid[:-1, None] + np.diff(grid)[:, None] * c).ravel()
-    np.testing.assert_allclose(found[:, 0], cubic(t), rtol=1e-12)
 
 
 def still(t):

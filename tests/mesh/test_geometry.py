@@ -244,16 +244,6 @@ def test_step_with_bores(shared_tmp_path, z, shape):
 
 
 @pytest.mark.serial  # Gmsh runs on one rank
-def test_step_with_straight_ends(shared_tmp_path):
-    path = step_file(shared_tmp_path / "arm.stp", bar=bar_with_straight_ends)
-    mesh = arm_mesh(COMM, entry(path))  # a twelfth of the height
-    assert figures(mesh)[1] == pytest.approx(LENGTH * HEIGHT, rel=1e-9)
-    for facets, x in ((mesh.inboard_facets, 0.0), (mesh.outboard_facets, LENGTH)):
-        low, high = (f(facet_nodes(mesh, facets), axis=0) for f in (np.min, np.max))
-        np.testing.assert_allclose([low, high], [[x, -0.03], [x, 0.03]], atol=1e-9)
-
-
-@pytest.mark.serial  # Gmsh runs on one rank
 def test_step_product_named_passive_stays_solid(shared_tmp_path):
     """Two products that touch without a common curve; the ring's inner circle is the interface."""
     path = step_file(shared_tmp_path / "arm.step", arm=plate, passive=ring)

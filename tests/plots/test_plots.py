@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from bodies import plane_body, plane_chain
 from machines import GAINS, controlled, loop
-from matplotlib.collections import PathCollection
 from mpi4py import MPI
 from PIL import Image
 
@@ -18,7 +17,6 @@ from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots import curves, design, machine
-from dolfinopt.plots.poses import POSES, body_poses, shown_poses
 from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -190,10 +188,6 @@ def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
         shown(curves.deviation_figure(t, deviation, 1.3 * deviation))
 
 
-def cells_of(axes):
-    return [each for each in axes.collections if isinstance(each, PathCollection)]
-
-
 def test_motion_shows_the_payload_where_it_is(tmp_path):
     views, mechanism = manipulator(2)
     moving = swinging(mechanism)
@@ -213,26 +207,6 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
             pixel = picture[round(len(picture) - y), round(x)]
             assert np.abs(pixel - [217, 95, 2]).max() <= 16
     assert (pictures[3] != pictures[0]).any(axis=2).sum() > 1000
-
-
-@pytest.mark.parametrize("arms", [1, 3])
-def test_machine_shows_every_arm_where_it_is(arms):
-    views, mechanism = manipulator(arms)
-    moving = swinging(mechanism)
-    figure = machine.machine_figure(views, moving, "title")
-    axes = figure.axes[0]
-    rigid = body_poses(mechanism, moving.q_r, 0.0 * moving.q_e)
-    at = shown_poses(rigid)
-    assert len(at) == POSES
-    assert [text.get_text() for text in axes.texts] == [f"{moving.t[n]:.2f} s" for n in at]
-    cells = cells_of(axes)
-    assert len(cells) == arms * len(at)
-    # Void is left open: half of each arm's 80 cells.
-    assert {sum(len(path) for path in each.get_paths()) for each in cells} == {40 * 5}
-    ends = [line.get_xydata()[0] for line in axes.lines if line.get_markersize() == 10.0]
-    np.testing.assert_allclose(ends, rigid.end[at])
-    solid = np.abs(shown(figure) - [8, 29, 88]).max(axis=2) < 12
-    assert solid.sum() > 2000
 
 
 @pytest.mark.slow
