@@ -13,13 +13,11 @@ from solids import elastic_link, link_mesh
 
 from dolfinopt.fem import forms
 from dolfinopt.fem.elasticity import Substructure
-from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.fem.tensors import (
     element_of,
     stress_points,
 )
 from dolfinopt.mesh.arm_mesh import arm_mesh, box_arm
-from dolfinopt.reduction import Options, craig_bampton
 from dolfinopt.scene.load import Arm
 
 COMM = MPI.COMM_WORLD
@@ -169,24 +167,6 @@ def test_rates_of_convergence(shape, element):
     )
     assert np.log2(coarse / fine) == pytest.approx(RATES[shape, element], abs=0.01)
     assert fine < 1e-3
-
-
-@pytest.mark.parametrize(
-    ("name", "triangles"),
-    [*((name, False) for name in forms.ELEMENTS), ("linear", True), ("quadratic", True)],
-)
-def test_ranks(name, triangles):
-    """Stiffness, mass and K0 of the reduced arm do not depend on how many ranks share it."""
-
-    def reduced(comm):
-        arm = solid_arm(name, meshed((12, 4), triangles, comm), 0.33)
-        basis = craig_bampton(arm, Options(5))
-        mass = comm.allreduce(np.tensordot(basis.V, basis.MV, ((0, 1), (0, 1))))
-        return basis.stiffness, mass, unit_loads(arm).geometric_stiffness(basis.V)
-
-    for one, other in zip(reduced(COMM), reduced(MPI.COMM_SELF), strict=True):
-        # Eigenvectors are right to 1e-10.
-        assert np.abs(one - other).max() < 1e-8 * np.abs(other).max()
 
 
 @pytest.mark.serial  # ranks: test_ranks

@@ -188,6 +188,45 @@ def boom(**changes: Any) -> Tree:
 
 BOOM_TABLE = "t,slew,cylinder\n0,0,1.0\n1,0.5,1.25\n"
 
+BASE, PLATE, UPPER, LOWER, SPREAD = 0.2, 0.05, 0.2, 0.45, 0.04  # m, of the delta
+
+
+def delta() -> Tree:
+    """Return three flexible upper arms that carry a plate by six rods; it moves as these let it."""
+    slides = [("x", [1, 0, 0]), ("y", [0, 1, 0]), ("z", UP)]
+    turns = [("rx", [1, 0, 0]), ("ry", [0, 1, 0]), ("rz", UP)]
+    arms, joints, ends, closures = [], [], [], []
+    for k in range(3):
+        angle, side = 2.0 * np.pi * k / 3.0, 0.5 * SPREAD
+        c, s = np.cos(angle), np.sin(angle)
+        arms.append(flexible(f"upper{k}", UPPER + 0.06, cells=[13, 2, 2], thickness=SPREAD,
+                             interfaces=[{"name": f"rod{i}", "radius": 0.013,
+                                          "point": [UPPER, 0.0, (2 * i - 1) * side]}
+                                         for i in (0, 1)]))  # fmt: skip
+        # About the tangent of the base's circle: at zero outwards, positive downwards.
+        joints.append(hinge(f"drive{k}", "ground", f"upper{k}", rpy=[-QUARTER, 0, angle],
+                            origin=[BASE * c, BASE * s, 0.0]))  # fmt: skip
+        for i in (0, 1):
+            # The arm's z is the base's tangent: (s, -c, 0) for this roll and yaw.
+            away = (2 * i - 1) * side
+            point = [PLATE * c - away * s, PLATE * s + away * c, 0.0]
+            ends.append((f"p{k}{i}", point))
+            closures.append({"name": f"rod{k}{i}", "kind": "rod", "length": LOWER,
+                             "between": [f"plate.p{k}{i}", f"upper{k}.rod{i}"]})  # fmt: skip
+    below = "ground"
+    for name, axis in slides + turns:
+        child = "plate" if name == "rz" else f"carrier {name}"
+        arms.append(weightless(child, *ends) if name == "rz" else weightless(child))
+        kind = "prismatic" if len(name) == 1 else "revolute"
+        joints.append({"name": name, "type": kind, "parent": below, "child": child, "axis": axis,
+                       "passive": True})  # fmt: skip
+        below = child
+    start = [0.5, 0.5, 0.5, 0, 0, -0.4, 0, 0, 0]
+    return {
+        "name": "delta", "arms": arms, "joints": joints, "closures": closures,
+        "motion": {"initial_joints": start}, "payload": {"mass": 0.5},
+    }  # fmt: skip
+
 
 def flexible_slider_crank(folder: Path) -> Scene:
     """Return the machine of `flexible_slider_crank_in_space.csv`: 0.5 N m on a free crank."""

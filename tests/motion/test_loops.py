@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 import tomllib
 from loops import (
+    BASE,
     BOOM_TABLE,
     FOOT,
     HEAD,
+    LOWER,
     LUG,
+    PLATE,
+    UPPER,
     boom,
     closed,
     cranks,
     crossed_crank,
+    delta,
     driven_slider,
     five_bar,
     four_bar,
@@ -64,6 +69,17 @@ def of_boom(q):
     return np.sqrt(square) - length
 
 
+def of_delta(q):
+    """Its plate does not turn, and is as far as the rods are long from all three elbows."""
+    found = [*q[:, 6:].T]
+    for k in range(3):
+        angle, down = 2.0 * np.pi * k / 3.0, np.array([0.0, 0.0, -1.0])
+        out = np.array([np.cos(angle), np.sin(angle), 0.0])
+        elbow = (BASE + UPPER * np.cos(q[:, k, None])) * out + UPPER * np.sin(q[:, k, None]) * down
+        found.append(np.linalg.norm(q[:, 3:6] + PLATE * out - elbow, axis=1) - LOWER)
+    return np.stack(found)
+
+
 def of_four_bar(q):
     """Coupler and rocker end at the foot."""
     a, b, c = np.cumsum(q, axis=1).T
@@ -93,6 +109,7 @@ def of_crossed_crank(q):
         (five_bar(), "t,a,b\n0,2.0,1.1\n1,1.6,0.8\n", of_five_bar),
         (parallelogram(), "t,shoulder\n0,0.3\n1,1.0\n", of_parallelogram),
         (boom(), BOOM_TABLE, of_boom),
+        (delta(), "t,drive0,drive1,drive2\n0,0.5,0.5,0.5\n1,0.9,0.3,0.6\n", of_delta),
     ],
     ids=lambda one: one["name"] if isinstance(one, dict) else "",
 )
@@ -122,10 +139,11 @@ def test_a_path_of_the_tool_moves_the_drives(tmp_path):
 
 
 def test_redundant_equations_are_counted(tmp_path):
-    """Of a pin's five equations a plane four-bar needs two, of a ball's three as many."""
+    """Of a pin's five equations a plane four-bar needs two; rods of the delta all count."""
     for tree, table, redundant in (
         (four_bar("pin"), "t,turn\n0,0.5\n1,1.0\n", 3),
         (four_bar("ball"), "t,turn\n0,0.5\n1,1.0\n", 1),
+        (delta(), "t,drive0,drive1,drive2\n0,0.5,0.5,0.5\n1,0.6,0.5,0.5\n", 0),
     ):
         start = follower(closed(tmp_path, table, tree)).start
         assert start.redundant == redundant and start.misfit == 0.0

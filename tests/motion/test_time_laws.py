@@ -1,7 +1,5 @@
 """Time laws against closed forms, differences and their limits; tables with stops."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from bodies import assert_close
@@ -44,24 +42,6 @@ def peaks(law, duration, length):
         values = law(dense[1:-1], duration)[1], fit(dense), fit.deriv()(dense)
         largest = np.maximum(largest, [np.abs(x).max() for x in values])
     return length * largest
-
-
-@EVERY
-@pytest.mark.parametrize("share", [0.05, 0.25, 0.5])
-def test_speed_is_the_rate_and_its_area_the_distance(name, share):
-    """By Gauss' rule between the knots, exact there; acceleration likewise to the speed."""
-    law, duration = law_of(name, share), 1.7
-    ends = pieces(law, duration)
-    nodes, weights = np.polynomial.legendre.leggauss(5)
-    for order in (1, 2):
-        before = law(np.zeros(1), duration)[order - 1]
-        for a, b in pairwise(ends):
-            t = 0.5 * (a + b) + 0.5 * (b - a) * nodes
-            gained = 0.5 * (b - a) * weights @ law(t, duration)[order]
-            after = law(np.array([b]), duration)[order - 1]
-            assert_close(after - before, [gained], 1e-13, 10.0)
-            before = after
-        assert_close(before, [2.0 - order], 1e-13, 1.0)
 
 
 def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives():
