@@ -235,27 +235,6 @@ def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key):
     assert float(found[2]) == pytest.approx(distance, rel=1e-3, abs=5e-6)
 
 
-@pytest.mark.parametrize("law", ["quintic", "septic", "trapezoidal", "s-curve"])
-def test_points_of_a_straight_line_are_the_line(tmp_path, law):
-    """Whatever their distances; without times the law of the scene holds until the last instant.
-
-    There a trapezoidal speed still brakes; a jump within a step would cost the integrator many.
-    """
-    shares = np.array([0.0, 0.13, 0.2, 0.71, 1.0])
-    rows = np.array([-0.7, -0.1]) + np.outer(shares, [1.3, 0.5])
-    file = tmp_path / "line.csv"
-    file.write_text("\n".join(["x,y", *(f"{x!r},{y!r}" for x, y in rows.tolist())]))
-    straight_path, points = (
-        scene(law=law, **keys) for keys in (PATHS["line"], {"path": "points", "file": str(file)})
-    )
-    t = np.union1d(DENSE, breakpoints(straight_path))
-    straight, found = (rigid_motion(t, of) for of in (straight_path, points))
-    assert_close(found.q, straight.q, 1e-13)
-    assert_close(found.qdd, straight.qdd, 1e-12)
-    last = rigid_motion(np.array([DURATION]), points).qdd
-    assert (np.abs(last).max() > 0.1) == (law == "trapezoidal")
-
-
 def test_breakpoints(tmp_path):
     """The end of the path, and the rows of a short table without times."""
     assert breakpoints(scene()) == (0.0, DURATION, 3.0)

@@ -143,17 +143,6 @@ def test_loops_in_space_leave_their_forces_and_what_follows(tmp_path):
     assert "of 5 equations 3 follow from the others" in told
 
 
-@pytest.mark.serial
-def test_prescribed_motion_leaves_what_it_left(tmp_path):
-    scene = do.load_scene(TWO_ARM, ["arms.cells=[16,2]", "motion.base=fixed", "motion.radius=0.4"])
-    arrays, table, summary, _ = left_by(scene, tmp_path)
-    assert "q_r_desired" not in arrays and "closure_force" not in arrays
-    assert arrays["joint_forces"].shape[1] == 3
-    drives = [name for name in table.dtype.names if name.startswith("joint_force")]
-    assert drives == ["joint_force_arm1", "joint_force_arm2"]  # a fixed base is no drive
-    assert list(summary["units"]["drive_peak"]) == ["arm1", "arm2"]
-
-
 # -- what a run leaves: the same files from both ways, the summary last  --------------------------
 
 
