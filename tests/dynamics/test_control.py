@@ -1,4 +1,4 @@
-"""Machines under control: against geometrically exact beams, energy, stiff limits, soft joints."""
+"""Machines under control: against geometrically exact beams, saturation, soft joints."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Forces on interfaces, [[forces]]: closed forms, energy, control, batches."""
+"""Forces on interfaces, [[forces]]: closed forms and control."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The integrator against closed forms, itself with more stages, and its own estimate."""
+"""The integrator against itself with more stages, and its own estimate."""
 
 from dataclasses import replace
 from itertools import product

@@ -1,4 +1,4 @@
-"""Systems and vibrations as integrators see them: an interface, and steps too long for them."""
+"""Vibrations that steps are too long for, and joints that move freely."""
 
 import numpy as np
 import pytest

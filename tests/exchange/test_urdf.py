@@ -1,4 +1,4 @@
-"""Robots from URDF: kinematics and inertia of the scene; solids."""
+"""Robots from URDF: drive forces against Pinocchio's; solids."""
 
 import re
 from types import SimpleNamespace

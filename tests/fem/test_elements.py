@@ -1,4 +1,4 @@
-"""The elements: patch test, bending, rates of convergence; a form of a test's own beside them."""
+"""The elements: patch test, torsion, rates of convergence; a form of a test's own beside them."""
 
 from functools import cache
 

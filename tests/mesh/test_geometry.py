@@ -581,6 +581,3 @@ def test_gmsh_may_end_its_own_process_alone_and_ctrl_c_ends_it(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         in_child(time.sleep, 600.0)
     assert not multiprocessing.active_children()
-
-
-# -- names in STEP files: a text written out by hand, a square with a hole, in millimetres  -------

@@ -1,4 +1,4 @@
-"""Reduced bases against dense eigenproblems, full solves and beam theory."""
+"""Reduced bases against dense eigenproblems and full solves."""
 
 import dataclasses
 import gc
