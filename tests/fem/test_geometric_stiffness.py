@@ -1,4 +1,4 @@
-"""Geometric stiffness against a rotating beam, Euler's load, nonlinear elasticity and finite differences."""
+"""Geometric stiffness against a rotating beam, Euler's load, nonlinear elasticity, differences."""
 
 from typing import NamedTuple
 
