@@ -307,6 +307,9 @@ def test_what_comparisons_and_studies_plan():
     plan = study.objective_plan(scene("arms.passive=0.05"))
     every = (*variants.OBJECTIVES, *variants.RESPONSES[:2])
     assert [c.label for _, c in plan.rows] == ["initial design", *(label for label, _ in every)]
+    # The drives' effort takes as much material as its limits ask for.
+    limited = scene("constraints.compliance=30")
+    assert variants.posed(limited, "effort").design.volume_fraction == 1.0
     # Solid arms, as those of parts, leave nothing to optimise.
     solid = do.load_scene(TWO_ARM, ["design.initial=1.0", "design.volume_fraction=1.0"])
     assert given_designs(solid, ()) == {"solid arms": None}
