@@ -61,7 +61,7 @@ def test_words_of_the_scene_are_those_of_the_code():
 # -- seconds by phase: each is counted once  ------------------------------------------------------
 
 
-def test_nested_phases_share_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nested_phases_share_the_time(monkeypatch):
     """An inner phase stops the clock of the outer one, also where it ends by an error."""
     now = 0.0
     monkeypatch.setattr(profile.time, "perf_counter", lambda: now)

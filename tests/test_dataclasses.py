@@ -4,9 +4,8 @@ import importlib
 import inspect
 import pkgutil
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 OPTIONAL = {"bench"}  # imports programs that a plain installation does not have
 
 
-def dataclasses() -> Iterator[type]:
+def dataclasses():
     """Yield every dataclass that a module of the package defines."""
     for module in pkgutil.walk_packages(do.__path__, "dolfinopt."):
         if module.name.endswith("__main__"):
@@ -34,7 +33,7 @@ def dataclasses() -> Iterator[type]:
                 yield found
 
 
-def holds_array(hint: Any) -> bool:
+def holds_array(hint):
     """Return whether values of this type, or what they contain, are arrays; not of functions."""
     if isinstance(hint, str):  # a name that only type checkers import
         return "ndarray" in hint and "Callable" not in hint
@@ -45,7 +44,7 @@ def holds_array(hint: Any) -> bool:
     return any(map(holds_array, typing.get_args(hint)))
 
 
-def hints(of: type) -> Iterator[Any]:
+def hints(of):
     """Yield the types of a dataclass' fields, or their text where a name is not known here."""
     known = vars(importlib.import_module(of.__module__))
     for field in fields(of):  # type: ignore[arg-type]
@@ -55,7 +54,7 @@ def hints(of: type) -> Iterator[Any]:
             yield field.type
 
 
-def test_dataclasses_with_arrays_compare_by_identity() -> None:
+def test_dataclasses_with_arrays_compare_by_identity():
     """The generated == raises where a field is an array: it has no single truth value."""
     found = list(dataclasses())
     assert RigidMotion in found

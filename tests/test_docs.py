@@ -16,7 +16,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 from typing import NamedTuple
 
 import pytest
@@ -49,7 +48,7 @@ class Block(NamedTuple):
     note: str
 
 
-def blocks(page: Path) -> list[Block]:
+def blocks(page):
     """Return the fenced blocks of a page, indented ones of lists and notes included."""
     pattern = re.compile(
         r"(?:^[ ]*<!-- test: (?P<note>.*?) -->\n)?"
@@ -75,7 +74,7 @@ def folder(tmp_path, monkeypatch):
         yield tmp_path
 
 
-def with_key(scene: str, table: str, key: str, value: str) -> str:
+def with_key(scene, table, key, value):
     """Return the text of a scene with a key of a table set, whether it was there or not."""
     if f"[{table}]" not in scene:
         return f"{scene}\n[{table}]\n{key} = {value}\n"
@@ -85,7 +84,7 @@ def with_key(scene: str, table: str, key: str, value: str) -> str:
     return f"{head}{mark}\n{key} = {value}{body}{more}"
 
 
-def made_small(scene: str) -> str:
+def made_small(scene):
     """Return the text of a scene with few cells, iterations and samples, roughly solved."""
     for key, value in SETTINGS.items():
         scene = re.sub(rf"^{key} = \S.*?(?=\s*#|$)", f"{key} = {value}", scene, flags=re.MULTILINE)
@@ -105,7 +104,7 @@ def made_small(scene: str) -> str:
 
 @pytest.mark.parametrize("page", TESTED, ids=lambda page: page.stem)
 def test_every_block_runs(page, folder):
-    names: dict = {"__name__": "__docs__"}
+    names = {"__name__": "__docs__"}
     for block in blocks(page):
         if block.note.startswith("skip"):
             assert len(block.note) > len("skip, "), f"{page.name}: say why a block is skipped"
@@ -127,7 +126,7 @@ def test_every_block_runs(page, folder):
             tomllib.loads(block.text)
 
 
-def run(line: str, note: str, folder: Path) -> None:
+def run(line, note, folder):
     """Run one line of a shell block in this process; scenes that it writes are made small."""
     words = shlex.split(line, comments=True)
     while words and re.fullmatch(r"[A-Z_]+=.*", words[0]):
@@ -189,7 +188,7 @@ def test_messages_of_troubleshooting_are_those_of_the_program():
         assert part.strip() in told, part
 
 
-def strings(path: Path) -> list[str]:
+def strings(path):
     """Return the texts of a module; one with values put in is joined without them."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     constants = [one.value for one in ast.walk(tree) if isinstance(one, ast.Constant)]

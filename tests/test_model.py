@@ -10,7 +10,7 @@ from runs import ROOT as FOLDER
 from runs import TWO_ARM, refusal
 
 import dolfinopt as do
-from dolfinopt import Model, OptimizationResult
+from dolfinopt import Model
 from dolfinopt.arms.arm import stiffening_of
 
 WORLD = MPI.COMM_WORLD
@@ -19,16 +19,16 @@ SMALL = "arms.cells=[24,4]", "simulation.sample=0.01", "optimizer.max_iterations
 
 
 @pytest.fixture(scope="module")
-def model() -> Model:
+def model():
     return Model(TWO_ARM, *SMALL)
 
 
 @pytest.fixture(scope="module")
-def result(model: Model) -> OptimizationResult:
+def result(model):
     return model.optimize()
 
 
-def test_simulate_is_evaluate(model: Model) -> None:
+def test_simulate_is_evaluate(model):
     """The initial design by name, by default, and by the functions give the same bits."""
     scene = do.load_scene(TWO_ARM, SMALL)
     partition = do.partition_arms(WORLD, scene.cell_counts)
@@ -50,7 +50,7 @@ def test_simulate_is_evaluate(model: Model) -> None:
         assert frame is None and found.design == {}
 
 
-def test_a_design_comes_back_in_the_order_it_was_given(model: Model) -> None:
+def test_a_design_comes_back_in_the_order_it_was_given(model):
     x = {name: 0.3 + 0.4 * points[:, 0] for name, points in model.centroids.items()}
     found = model.simulate(x)
     again = model.simulate(found)
@@ -60,11 +60,11 @@ def test_a_design_comes_back_in_the_order_it_was_given(model: Model) -> None:
     assert again.evaluation == found.evaluation
 
 
-def test_arms_are_meshed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arms_are_meshed_once(monkeypatch):
     """Optimisation and simulation share mesh, operators and solver, and nothing of a design."""
     from dolfinopt.arms import arm as arms
 
-    meshed: list[str] = []
+    meshed = []
 
     def counted(comm, arm, pattern=None):
         meshed.append(arm.name)
@@ -87,7 +87,7 @@ def test_arms_are_meshed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert sum(WORLD.allgather(len(meshed))) == 2 * sum(mine)
 
 
-def test_optimize_has_history_design_and_pictures(result: OptimizationResult) -> None:
+def test_optimize_has_history_design_and_pictures(result):
     assert result.iterations == 2
     assert not result.converged
     assert "max_iterations = 2" in result.stop_reason
@@ -105,7 +105,7 @@ def test_optimize_has_history_design_and_pictures(result: OptimizationResult) ->
     assert max(curves[1].get_ydata()) == pytest.approx(1e3 * result.max_deviation)
 
 
-def test_study_is_a_table(model: Model, result: OptimizationResult) -> None:
+def test_study_is_a_table(model, result):
     frame = model.study("payload.mass=2,6", designs=[result])
     assert len(frame) == 2
     compliance = [name for name in frame if "compliance" in name]
@@ -115,7 +115,7 @@ def test_study_is_a_table(model: Model, result: OptimizationResult) -> None:
     assert nominal == pytest.approx(result.compliance, rel=model.scene.simulation.tolerance)
 
 
-def test_scenes_from_dictionaries_and_scenes() -> None:
+def test_scenes_from_dictionaries_and_scenes():
     data = do.load_scene(TWO_ARM).to_tree() if ROOT else {}
     model = Model(data, "payload.mass=4")
     assert model.scene.payload.mass == 4.0
@@ -131,17 +131,17 @@ def test_scenes_from_dictionaries_and_scenes() -> None:
         ({"arm1": np.full(96, 2.0), "arm2": np.zeros(96)}, ["arm 'arm1' = 2 at cell 0"]),
     ],
 )
-def test_designs_that_do_not_fit_are_refused_on_all_ranks(model: Model, x, words) -> None:
+def test_designs_that_do_not_fit_are_refused_on_all_ranks(model, x, words):
     refusal(lambda: model.simulate(x), *words)
 
 
-def test_bad_arguments_are_refused(model: Model) -> None:
+def test_bad_arguments_are_refused(model):
     refusal(lambda: model.gradient(kind="fast"), "'fast'", "esl, exact")
     refusal(lambda: model.uniform(1.5), "density")
     refusal(lambda: Model(TWO_ARM, "payload.masse=4"), "payload.masse", "payload.mass")
 
 
-def test_changes_as_a_mapping() -> None:
+def test_changes_as_a_mapping():
     """Values keep their types, NumPy's and tables included; strings as before."""
     model = Model(TWO_ARM, {
         "payload.mass": np.float64(4.0), "arms.arm1.cells": np.array([24, 4]),
@@ -155,7 +155,7 @@ def test_changes_as_a_mapping() -> None:
     refusal(lambda: Model(TWO_ARM, {"payload.masse": 4}), "payload.masse", "payload.mass")
 
 
-def test_values_and_gradients_by_name() -> None:
+def test_values_and_gradients_by_name():
     """Central differences; a limit's smooth value is differentiated, its scale is held."""
     model = Model(TWO_ARM, *SMALL, {
         "objective.kind": "mass", "constraints.deviation": 0.02, "constraints.first_frequency": 9.0,
@@ -179,7 +179,7 @@ def test_values_and_gradients_by_name() -> None:
         assert (up[name] - down[name]) / (2.0 * h) == pytest.approx(slope, rel=1e-5, abs=1e-9)
 
 
-def test_stiffening_is_decided_for_each_design() -> None:
+def test_stiffening_is_decided_for_each_design():
     """Its estimate is that of the design, whatever the model has simulated before."""
     used, fresh = (Model(TWO_ARM, *SMALL) for _ in range(2))
     used.simulate(used.uniform(0.4))
@@ -189,7 +189,7 @@ def test_stiffening_is_decided_for_each_design() -> None:
     assert found[0] == found[1]
 
 
-def test_a_design_to_begin_with(model: Model) -> None:
+def test_a_design_to_begin_with(model):
     """The first row of the history is the design given; the callback sees every row."""
     x = {name: 0.3 + 0.4 * points[:, 0] for name, points in model.centroids.items()}
     rows = []
@@ -202,7 +202,7 @@ def test_a_design_to_begin_with(model: Model) -> None:
         model.optimize()
 
 
-def test_results_are_saved_and_pickled(model: Model, result, shared_tmp_path) -> None:
+def test_results_are_saved_and_pickled(model, result, shared_tmp_path):
     """What was pickled saves the same design, and a model that was simulates the same."""
     copy = pickle.loads(pickle.dumps(result))
     copy.save(shared_tmp_path / "run")
@@ -218,7 +218,7 @@ def test_results_are_saved_and_pickled(model: Model, result, shared_tmp_path) ->
         assert again.simulate(result).evaluation == model.simulate(result).evaluation
 
 
-def test_a_notebook_shows_picture_and_figures(model: Model, result) -> None:
+def test_a_notebook_shows_picture_and_figures(model, result):
     found = model.simulate()
     assert found.warnings == ()
     html = result._repr_html_()
@@ -229,7 +229,7 @@ def test_a_notebook_shows_picture_and_figures(model: Model, result) -> None:
         assert html is None
 
 
-def test_the_algorithm_on_one_page_is_optimize() -> None:
+def test_the_algorithm_on_one_page_is_optimize():
     """demos/demo_algorithm.py, of public parts, has the same history."""
     path = FOLDER / "demos" / "demo_algorithm.py"
     spec = importlib.util.spec_from_file_location("demo_algorithm", path)
@@ -241,33 +241,3 @@ def test_the_algorithm_on_one_page_is_optimize() -> None:
     if ROOT:
         rows = [row.objective for row in result.rows]
         np.testing.assert_allclose(history, rows, rtol=1e-9)
-
-
-def test_a_machine_a_thousandth_as_large_has_the_same_design() -> None:
-    """Lengths times s, E times s^2, mass times s^3, times kept: defaults follow the arms."""
-    s = 1e-3
-    found = []
-    for scale in (1.0, s):
-        data = {
-            "material": {
-                "young_modulus": 70e9 * scale**2, "poisson_ratio": 0.33, "density": 2700.0,
-            },
-            "arms": [
-                {"name": "arm1", "length": scale, "height": 0.06 * scale,
-                 "thickness": 0.01 * scale, "cells": [24, 4]},
-                {"name": "arm2"},
-            ],
-            "motion": {"path": "arc", "duration": 1.9},
-            "payload": {"mass": 6.0 * scale**3},
-            "damping": {"stiffness_proportional": 2e-4},
-            "optimizer": {"max_iterations": 8},
-        }  # fmt: skip
-        model = Model(data)
-        assert model.scene.motion.radius == pytest.approx(scale)
-        assert model.scene.motion.joint_height == pytest.approx(-0.5 * scale)
-        assert model.scene.design.filter_radius == pytest.approx(0.0075 * scale)
-        found.append(model.optimize())
-    large, small = found
-    assert small.objective == pytest.approx(s**5 * large.objective, rel=1e-9)
-    for name, x in large.design.items():
-        np.testing.assert_allclose(small.design[name], x, atol=1e-6)

@@ -13,7 +13,7 @@ NOTEBOOK = Path(__file__).parents[1] / "demos" / "from_python.ipynb"
 def test_every_cell_of_the_notebook_runs(monkeypatch, capsys):
     monkeypatch.chdir(NOTEBOOK.parent)
     monkeypatch.setattr(logging, "basicConfig", lambda: None)  # pytest has its own
-    names: dict = {"__name__": "notebook"}
+    names = {"__name__": "notebook"}
     for number, cell in enumerate(json.loads(NOTEBOOK.read_text(encoding="utf-8"))["cells"]):
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), f"cell {number}", "exec"), names)

@@ -7,9 +7,7 @@ nothing twice is tested where that part is.
 import ast
 import subprocess
 import sys
-from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,17 +27,14 @@ QUICK = ("arms.cells=[12,2]", "motion.horizon=2.0", "simulation.sample=0.01",
 ITERATIONS = 2
 ARMS, DESIGNS = 2, ITERATIONS + 1  # the last one's gradient tells how far it is from an optimum
 
-Counts = dict[str, int]
-Run = Callable[..., Path]
-
 
 @pytest.fixture(scope="module")
-def run(folder: Path) -> Run:
+def run(folder):
     """Run a command on the small scene with overrides; return its folder. Once for each."""
-    made: list[Path] = []
+    made = []
 
     @cache
-    def once(command: str, *overrides: str, design: Path | None = None) -> Path:
+    def once(command, *overrides, design=None):
         made.append(folder / str(len(made)))
         line = [command, str(TWO_ARM), "--no-plots", "--out", str(made[-1])]
         line += ["--design", str(design)] if design else []
@@ -50,7 +45,7 @@ def run(folder: Path) -> Run:
     return once
 
 
-def counts(folder: Path) -> Counts:
+def counts(folder):
     """Return the counters of a run."""
     return summary_of(folder)["counts"]
 
@@ -69,7 +64,7 @@ EVERYTHING = (EXACT, "constraints.first_frequency=1.0", "constraints.tip_deflect
 STATIC = STILL | {"assemblies": EACH, "factorisations": EACH, "solves": 3 * EACH}
 STATIC |= {"eigenproblems": 0}
 
-CASES: dict[tuple[str, ...], Counts] = {
+CASES = {
     # Nothing twice for one design: a factor an arm and design; frozen loads need no adjoint.
     (): {**ONCE, "eigenproblems": EACH, "simulations": DESIGNS, "adjoints": 0},
     # With everything a scene may ask for the factor is the same; modes are those of the basis, and
@@ -107,7 +102,7 @@ ON_RANKS = [(), EVERYTHING, (SHARED, EXACT), (RIGID,)]
     [pytest.param(o, marks=() if o in ON_RANKS else pytest.mark.serial) for o in CASES],
     ids=" ".join,
 )
-def test_only_what_the_scene_needs(run: Run, overrides: tuple[str, ...]) -> None:
+def test_only_what_the_scene_needs(run, overrides):
     found = counts(run("optimize", *overrides))
     expected = CASES[overrides]
     assert {key: found[key] for key in expected} == expected
@@ -128,7 +123,7 @@ ONE_LOAD, TIP = "objective.loads=[[0,1,0,0,0,0]]", "constraints.tip_deflection=1
     ],
     ids=["one load", "deflection", "frequency"],
 )
-def test_static_loads_of_solids(tmp_path, monkeypatch, width, overrides, most) -> None:
+def test_static_loads_of_solids(tmp_path, monkeypatch, width, overrides, most):
     """In space a solve a load, where nothing else is asked for, not one a constraint mode."""
     for bound in ("WIDEST", "WIDEST_OF_STATICS"):
         monkeypatch.setattr(interior, bound, width)
@@ -148,14 +143,14 @@ def test_static_loads_of_solids(tmp_path, monkeypatch, width, overrides, most) -
         assert found["solves"] >= most * EACH
 
 
-def test_a_simulation_needs_no_gradient(run: Run) -> None:
+def test_a_simulation_needs_no_gradient(run):
     found = counts(run("simulate", EXACT))
     assert found["adjoints"] == found["energy_fields"] == 0
     assert found["factorisations"] == ARMS and found["simulations"] == 1
 
 
 @pytest.mark.parametrize("kind", ["static", "eigenfrequency"])
-def test_nothing_moves_unless_asked(kind: str) -> None:
+def test_nothing_moves_unless_asked(kind):
     """No simulation and no reduced model without `simulated`; with it the same objective."""
     built = build(f"objective.kind={kind}")
     x = built.fields(wave)
@@ -169,7 +164,7 @@ def test_nothing_moves_unless_asked(kind: str) -> None:
 
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("gradient", ["esl", "exact"])
-def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
+def test_load_cases_cost_nothing(run, gradient):
     """From as many as coordinates on their number changes no count but Newton's iterations."""
     kept = ("reduction.coordinates=3", f"objective.gradient={gradient}")
     few, many = (
@@ -182,7 +177,7 @@ def test_load_cases_cost_nothing(run: Run, gradient: str) -> None:
 
 
 @cache
-def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
+def warm_and_cold(run, *overrides):
     """Return what the second design, a small step on, takes in an optimisation, and by itself."""
     small = (*overrides, "optimizer.move=0.02", "simulation.tolerance=1e-5")
     first = counts(run("optimize", *small, "optimizer.max_iterations=0"))
@@ -198,9 +193,7 @@ def warm_and_cold(run: Run, *overrides: str) -> tuple[Counts, Counts]:
     [(), ("reduction.method=modal", "arms.cells=[50,4]"), ("reduction.coordinates=6",)],
     ids=" ".join,
 )
-def test_modes_and_trajectory_start_from_the_last_designs(
-    run: Run, overrides: tuple[str, ...]
-) -> None:
+def test_modes_and_trajectory_start_from_the_last_designs(run, overrides):
     """Half of Newton's iterations or fewer: from cold it takes a second grid, too."""
     warm, cold = warm_and_cold(run, *overrides)
     assert warm["factorisations"] == cold["factorisations"] == ARMS
@@ -225,7 +218,7 @@ DRAW = {"pyvista", "vtkmodules.vtkRenderingCore", "matplotlib", "PIL"}
 SOLVE = {"dolfinx", "ufl", "slepc4py", "scipy", "gmsh"}
 
 
-def loaded(names: set[str], code: str, *arguments: object) -> set[str]:
+def loaded(names, code, *arguments):
     """Return which modules a process of its own has imported at its end."""
     line = [sys.executable, "-c", LOADED.format(code), " ".join(names), *map(str, arguments)]
     done = subprocess.run(line, capture_output=True, text=True, env=environment(), timeout=60)
@@ -234,7 +227,7 @@ def loaded(names: set[str], code: str, *arguments: object) -> set[str]:
 
 
 @pytest.mark.serial
-def test_model_imports_nothing_of_studies_pictures_and_space() -> None:
+def test_model_imports_nothing_of_studies_pictures_and_space():
     """And the package nothing at all."""
     assert loaded(DRAW | SOLVE | {"numpy", "mpi4py"}, "import dolfinopt") == set()
     others = DRAW | {"gmsh", "pandas", "scipy.stats", "dolfinopt.motion.follower"}
@@ -260,7 +253,7 @@ for line in {!r}:
 
 
 @pytest.mark.serial
-def test_words_and_completion_need_no_solver(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_words_and_completion_need_no_solver(monkeypatch):
     names = DRAW | SOLVE | {"petsc4py", "mpi4py", "numpy", "click"}
     lines = [[str(word) for word in words] for words in WORDS]
     assert loaded(names, ONE_BY_ONE.format(lines).replace("\n", "\n    ")) == {"click"}
@@ -271,7 +264,7 @@ def test_words_and_completion_need_no_solver(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.serial
-def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
+def test_without_plots_nothing_that_draws_is_imported(tmp_path):
     """Nor anything of other commands: statistics, studies, exports."""
     others = {"plots.design", "plots.curves", "study.studies", "exchange.standard_input"}
     others = {"scipy.stats", *(f"dolfinopt.{name}" for name in others)}
@@ -282,20 +275,18 @@ def test_without_plots_nothing_that_draws_is_imported(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.serial
-def test_plane_pictures_need_no_renderer(tmp_path: Path) -> None:
+def test_plane_pictures_need_no_renderer(tmp_path):
     line = ["simulate", TWO_ARM, "--animation", "--out", tmp_path / "out", *set_keys(*QUICK)]
     assert loaded(DRAW, MAIN, *line) == {"matplotlib", "PIL"}
     assert (tmp_path / "out" / "motion.gif").exists()
 
 
-def test_nothing_is_drawn_exported_or_gathered_unless_asked(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_is_drawn_exported_or_gathered_unless_asked(run, monkeypatch):
     """Designs are gathered when they are written, once, not in every iteration."""
     gathered = []
     gather_views = results.gather_views
 
-    def spy(*arguments: object) -> object:
+    def spy(*arguments):
         gathered.append(arguments)
         return gather_views(*arguments)
 

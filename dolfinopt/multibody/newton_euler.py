@@ -223,7 +223,7 @@ def inverse_dynamics(
         if (rotor := links[i].rotor) is not None:
             forces[:, k] += rotor.force
     if tree.cart is not None:
-        forces[:, 0] = tree.cart * motion.qdd[:, 0]
+        forces[:, 0] = tree.cart * (motion.qdd[:, 0] - tree.gravity[0])
         for i in tree.hanging[GROUND, 0]:
             forces[:, 0] += links[i].joint.load_on_carrier(loads.joints[i])[0]
     if tree.friction is not None:

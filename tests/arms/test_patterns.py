@@ -1,14 +1,12 @@
 """Designs of arms: their state, and arms that repeat another's design, scaled."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import STATED, TWO_ARM, overrides, refused, run, summary_of
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm, Patterns, uniform_design
+from dolfinopt.arms.arm import Arm, Patterns
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.output.design import read_design
 from dolfinopt.parallel import Partition
@@ -56,46 +54,6 @@ def test_cells_have_the_densities_of_their_partners(projection):
         assert 0.0 in known[0] and 1.0 in known[0]  # regions and solid ends, too
 
 
-LIMITED = "constraints.tip_deflection=1e-4", "constraints.first_frequency=50.0"
-MOVED = ("objective.gradient=exact", "simulation.tolerance=1e-7", "motion.horizon=2.2",
-         "constraints.deviation=0.02")  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        (*SCALED, *LIMITED, "objective.kind=static"),
-        (*REPEATED, REGIONS, *MOVED, "objective.kind=peak_force"),
-        pytest.param((*REPEATED, REGIONS, *MOVED, "objective.kind=stress"),
-                     marks=pytest.mark.serial),
-    ],
-)  # fmt: skip
-def test_gradients_by_the_design_of_both_arms(changes):
-    """Every arm's own limits, one volume; a void cell has no say: by central differences."""
-    scene, partition, arms = built(*changes)
-    evaluator = Evaluator(scene, partition, arms, do.Profile())
-    variables = evaluator.variables
-    x = variables.join({k: waves(arms[k]) for k in arms if k == 0})
-    x = np.clip(x, variables.xmin, variables.xmax)
-    free = variables.xmin < variables.xmax
-    direction = np.where(free, np.cos(1.7 * np.arange(x.size)), 0.0)
-    [here] = evaluator.evaluate(x)
-    assert np.isfinite(here.objective).all() and np.isfinite(here.constraints).all()
-    # p-means jump by 1e-4 where an instant falls below their limit: here 7e-5 away.
-    h = 1e-5
-    pairs = [evaluator.evaluate(x + sign * h * direction)[0].evaluation for sign in (1, -1)]
-    ahead, behind = (np.array([one.objective, *one.constraints]) for one in pairs)
-    slopes = np.vstack([here.objective, here.constraints]) @ direction
-    counted = slice(None) if "objective.kind=static" in changes else slice(1)
-    differences = (ahead - behind) / (2.0 * h)
-    np.testing.assert_allclose(slopes[counted], differences[counted], rtol=1e-5)
-    if counted == slice(None):
-        names = [(one.response, one.arms) for one in here.evaluation.responses[1:]]
-        both = ("arm1", "arm2")
-        limits = [("eigenfrequency", both), ("tip_deflection", both)]
-        assert names == [("volume_fraction", ("arm1",)), *limits]
-
-
 def test_any_number_of_ranks_ends_in_the_same_design():
     scene = do.load_scene(TWO_ARM, SCALED)
     together, alone = do.optimize(scene), do.optimize(scene, world=MPI.COMM_SELF)
@@ -119,18 +77,6 @@ def test_an_arm_on_two_ranks_has_partners_on_both():
     [back] = patterns.collect({1: u - v}).items()
     assert back[0] == 0
     np.testing.assert_allclose(back[1], x * 0.8 - y * 0.75, rtol=1e-9, atol=1e-12)
-
-
-def test_the_uniform_design():
-    scene, partition, arms = built(*SCALED)
-    uniform = uniform_design(scene, partition, arms, 0.3)
-    assert sorted(uniform) == sorted(arms)
-    for k, x_phys in uniform.items():
-        passive = arms[k].mesh.passive
-        assert passive.sum() == 2 * 2 * 4 and (x_phys[passive] == 1.0).all()
-        assert np.ptp(x_phys) > 0.5  # filtered at the ends of the pattern
-    volume = [arms[k].volume_fraction(x) for k, x in uniform.items()]
-    assert np.ptp(WORLD.allreduce(volume)) < 1e-12
 
 
 @pytest.mark.serial  # ranks: test_any_number_of_ranks_ends_in_the_same_design
@@ -218,13 +164,13 @@ def test_an_arm_takes_from_its_pattern_not_from_the_arm_before():
 # -- states of one arm: computed once, unmoved by later ones  -------------------------------------
 
 
-def small_arm() -> Arm:
+def small_arm():
     scene = do.load_scene(TWO_ARM, ["arms.cells=[16,3]"])
     return Arm(scene, 0, MPI.COMM_SELF, do.Profile())
 
 
 @pytest.mark.serial
-def test_a_state_is_computed_once_and_lasts() -> None:
+def test_a_state_is_computed_once_and_lasts():
     arm = small_arm()
     counts = arm.profile.counts
     x, other = arm.uniform(0.5), arm.uniform(0.7)
@@ -251,25 +197,7 @@ def test_a_state_is_computed_once_and_lasts() -> None:
 
 
 @pytest.mark.serial
-def test_what_states_share() -> None:
-    """Another order or scene reduces anew only where it must; the factor at hand serves all."""
-    arm = small_arm()
-    counts = arm.profile.counts
-    x = arm.uniform(0.5)
-    body = arm.reduce(x)
-    changes = ("arms.cells=[16,3]", "damping.stiffness_proportional=1e-3")
-    damped = arm.under(do.load_scene(TWO_ARM, changes))
-    assert damped.basis is arm.basis
-    assert np.allclose(damped.reduce(x).D, 5.0 * body.D, rtol=1e-12)
-    assert counts.reductions == 1
-    arm.set_order(6)
-    assert arm.basis is None and arm.reduce(x).num_modes == 6
-    assert damped.reduce(x).num_modes == 4
-    assert (counts.reductions, counts.factorisations, counts.assemblies) == (2, 1, 2)
-
-
-@pytest.mark.serial
-def test_an_arm_without_a_design_says_so() -> None:
+def test_an_arm_without_a_design_says_so():
     arm = small_arm()
     assert arm.basis is None
     with pytest.raises(RuntimeError, match=r"no design yet: call state"):

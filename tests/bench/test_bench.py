@@ -11,14 +11,9 @@ from runs import TWO_ARM, refusal, refused, run
 from dolfinopt.bench import accuracy, field, iterations, measure, panel, solid
 from dolfinopt.bench import run as benches
 from dolfinopt.bench.measure import Plan
-from dolfinopt.bench.panel import Diagram, Frame, figure_of, fitted_power, least_x
+from dolfinopt.bench.panel import Diagram, Frame, fitted_power
 from dolfinopt.bench.run import Goal, goal_table
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.exchange.urdf.file import read_robot
-from dolfinopt.exchange.urdf.scene import INERTIA
-from dolfinopt.multibody.newton_euler import inverse_dynamics
-from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import rigid_spatial_body
 from dolfinopt.paper.reproduction import load_paper
 
 pytestmark = pytest.mark.serial  # a bench runs on one rank and starts others itself
@@ -86,30 +81,6 @@ def test_bench_writes_and_goes_on(measured, tmp_path):
     assert rows == ["method,seconds [s],error [-]", "a,1,0.01", "b,1,", "a,10,0.001", "b,1,"]
     text = (tmp_path / "bench.md").read_text()
     assert "toy.png" in text and "| a        | 10" in text
-
-
-@pytest.mark.usefixtures("no_pictures")
-def test_rows_of_another_source_are_measured_anew(measured, monkeypatch):
-    """Rows of an older source do not stand beside today's."""
-    calls = []
-    one = toy(lambda step: calls.append(1) or [("a", 1.0, 1.0)], 1)
-
-    def again():
-        measured(one)
-        return len(calls)
-
-    assert again() == 1 and again() == 1
-    monkeypatch.setattr(benches, "source", lambda: "another")
-    assert again() == 2 and again() == 2
-
-
-def test_source_is_what_the_files_hold(tmp_path):
-    (tmp_path / "sub").mkdir()
-    digests = set()
-    for name, text in (("a.py", "1"), ("sub/b.py", "1"), ("sub/b.py", "2"), ("c.txt", "3")):
-        (tmp_path / name).write_text(text)
-        digests.add(benches.source.__wrapped__(tmp_path))
-    assert len(digests) == 3  # c.txt is no source
 
 
 @pytest.mark.usefixtures("no_pictures")
@@ -185,46 +156,13 @@ def test_ranks_need_no_settings(monkeypatch):
 # -- curves ----------------------------------------------------------------------------------
 
 
-def points(*rows, columns="name seconds error"):
-    return Frame(rows, columns=columns.split())
-
-
 def test_fitted_power():
     x = np.array([1.0, 3.0, 10.0])
     assert fitted_power(Frame({"x": x, "y": 5.0 * x**1.2})) == pytest.approx(1.2)
     assert math.isnan(fitted_power(Frame({"x": x[:1], "y": x[:1]})))
 
 
-def test_least_x_interpolates():
-    """Between its points, log over log; a curve that does not get there ends with a bound."""
-    curve = Frame([(1.0, 1e-3), (100.0, 1e-5)], columns=["seconds", "error"])
-    assert least_x(curve, 1e-4) == pytest.approx(10.0) and least_x(curve, 1e-3) == 1.0
-    assert least_x(curve, 1e-6) == pytest.approx(100.0)
-
-
-def test_figure_has_a_panel_a_group_and_quantity():
-    diagram = toy(None, columns="name | ranks | x | y | z", x="x", y=("y", "z"), by="name",
-                  each=("ranks",))  # fmt: skip
-    frame = diagram.frame([("a", 1, 1.0, 2.0, 3.0), ("a", 2, 1.0, 4.0, 5.0), ("b", 2, 6.0, 7.0, 8)])
-    shown = [
-        (panel.title, panel.y_label, [(one.label, *one.y) for one in panel.lines])
-        for panel in figure_of(diagram, frame).panels
-    ]
-    assert shown == [
-        ("ranks: 1", "y", [("a", 2.0)]),
-        ("ranks: 1", "z", [("a", 3.0)]),
-        ("ranks: 2", "y", [("a", 4.0), ("b", 7.0)]),
-        ("ranks: 2", "z", [("a", 5.0), ("b", 8.0)]),
-    ]
-
-
 # -- goals -----------------------------------------------------------------------------------
-
-
-def measures(diagram, **frames):
-    """Return what the diagram's goals measure of rows, by what they say."""
-    mine = [goal for goal in benches.GOALS if goal.diagram == diagram]
-    return {goal.what: goal.measure(frames[diagram]) for goal in mine}
 
 
 @pytest.mark.parametrize("diagram", (*benches.DIAGRAMS, *benches.NAMED), ids=lambda one: one.name)
@@ -240,6 +178,12 @@ def test_goals_are_met_or_not_or_not_measured():
     assert verdict(2.0, False) == ("at most 2", "2", "yes") and verdict(2.1, False)[2] == "no"
     assert verdict(2.1, True) == ("at least 2", "2.1", "yes") and verdict(1.9, True)[2] == "no"
     assert verdict(math.nan, True) == ("at least 2", "not measured", "")
+
+
+def measures(diagram, **frames):
+    """Return what the diagram's goals measure of rows, by what they say."""
+    mine = [goal for goal in benches.GOALS if goal.diagram == diagram]
+    return {goal.what: goal.measure(frames[diagram]) for goal in mine}
 
 
 def test_goals_of_simulations():
@@ -259,36 +203,6 @@ def test_goals_of_simulations():
     assert found(ours, *slow, ("a", lsoda, 3.0, 1e-4))[1] == pytest.approx(30.0)
     assert found(ours, *slow, ("a", lsoda, 20.0, 1e-4))[1] == pytest.approx(100.0)
     assert found(ours, *slow, ("b", usual, 0.2, 1e-5))[0] == 0.2
-
-
-def test_goals_of_iterations():
-    """Ratios at 400 x 24 cells in one run: CPU seconds on one rank, the wall clock on two."""
-    times = {iterations.PLAIN: (0.05, 0.06), iterations.OURS: (0.10, 0.11)}
-    times |= {iterations.TWO_RANKS: (0.20, 0.12)}
-    rows = [(name, 9600, *one, 10, 1.0, 300.0) for name, one in times.items()]
-    found = [*measures("iteration", iteration=iterations.ITERATION.frame(rows)).values()]
-    assert found[:2] == [pytest.approx(2.0), pytest.approx(2.0)] and all(map(math.isnan, found[2:]))
-    found = [*measures("iteration", iteration=iterations.ITERATION.frame(rows[1:])).values()]
-    assert all(map(math.isnan, found))
-    # The exponent is not fitted to the last cells; whole optimisations have more iterations.
-    rows = [(iterations.OURS, n, seconds, 1.0, 10, 1.0, 300.0)
-            for n, seconds in ((2400, 2400**1.2), (38400, 38400**1.2), (153600, 1e9))]  # fmt: skip
-    rows += [(iterations.TWO_RANKS, 2400, 1.0, 1.0, count, s, 300.0)
-             for count, s in ((400, 18.0), (10, 2.0))]  # fmt: skip
-    found = [*measures("iteration", iteration=iterations.ITERATION.frame(rows)).values()]
-    assert found[2:] == [pytest.approx(1.2), 18.0]
-
-
-def test_goals_of_errors():
-    """The default element on the coarsest mesh; the largest error over its tolerance."""
-    rows = [("incompatible", "50 x 3", 1, 1.0, 2e-3), ("linear", "50 x 3", 1, 1.0, 0.1)]
-    rows += [("incompatible", "100 x 6", 1, 1.0, 1e-4)]
-    assert [*measures("mesh", mesh=accuracy.ELEMENTS.frame(rows)).values()] == [pytest.approx(0.2)]
-    case = 0, "smooth", "arc", "quintic", 1.0, 1.0, 0.0, 4
-    rows = [(*case, 1e-2, 1e-3, 5e-3, 10), (*case, 1e-4, 1e-5, 8e-5, 10)]
-    for more, worst in (([], 0.8), ([(*case, 1e-3, math.inf, math.inf, 0)], math.inf)):
-        frame = accuracy.TOLERANCE.frame(rows + more)
-        assert [*measures("tolerance", tolerance=frame).values()] == [pytest.approx(worst)]
 
 
 @pytest.mark.parametrize("name", iterations.problems())
@@ -409,50 +323,3 @@ def test_wrong_words(words, told):
 
 
 ur10e = field.load_program(field.benchmark_folder() / "ur10e" / "ur10e.py")
-
-
-def write_robot(folder):
-    """Write six links on joints that turn about x, y and z, and records of their rigid motion."""
-    masses = [3.0, 2.5, 2.0, 1.0, 0.8, 0.5]
-    links, joints = ['<link name="link0"/>'], []
-    for k, mass in enumerate(masses, start=1):
-        inertia = f'ixx="{0.02 * mass}" iyy="{0.03 * mass}" izz="{0.015 * mass}"'
-        links.append(
-            f'<link name="link{k}"><inertial><origin xyz="0.05 0.02 {0.1 * k}"/><mass '
-            f'value="{mass}"/><inertia {inertia} ixy="0.001" ixz="0" iyz="0"/></inertial></link>'
-        )
-        axis = ("0 0 1", "0 1 0", "1 0 0")[k % 3]
-        joints.append(
-            f'<joint name="joint{k}" type="continuous"><parent link="link{k - 1}"/>'
-            f'<child link="link{k}"/><origin xyz="0.1 0 0.3" rpy="0 0.2 0"/><axis xyz="{axis}"/>'
-            "</joint>"
-        )
-    for file in (ur10e.UR10E, ur10e.LEARNT[0], ur10e.PREDICTED[0]):
-        (folder / file).parent.mkdir(parents=True, exist_ok=True)
-    robot = f'<robot name="six">{"".join(links + joints)}</robot>'
-    (folder / ur10e.UR10E).write_text(robot)
-    machine = ur10e.machine(folder / ur10e.UR10E)
-    own = read_robot(folder / ur10e.UR10E).links
-    bodies = [own[f"link{k}"].own for k in range(1, 7)]
-    rigid = [
-        rigid_spatial_body(b.mass, b.centre, [b.tensor[place] for place in INERTIA]) for b in bodies
-    ]
-    machine = replace(machine, bodies=tuple(rigid))
-    for number, (file, _, last) in enumerate((ur10e.LEARNT, ur10e.PREDICTED)):
-        t = 0.01 * np.arange(last + 50)
-        rate = np.array([0.7, 1.1, 0.9, 1.3, 1.7, 1.9]) + 0.1 * number
-        phase = np.outer(t, rate)
-        q, qd, qdd = np.sin(phase), rate * np.cos(phase), -(rate**2) * np.sin(phase)
-        none = np.zeros((len(t), 0))
-        torque = inverse_dynamics(machine, RigidMotion(q, qd, qdd), none, none, none)[1]
-        torque += 0.3 * qdd + 2.0 * qd - 0.5  # rotor and friction
-        np.savetxt(folder / file, np.column_stack([t, q, qd, torque / ur10e.GAINS]), delimiter=",")
-
-
-def test_torques_of_a_known_robot_are_predicted(tmp_path):
-    """What is left are the ends of the records, where the method has no accelerations."""
-    write_robot(tmp_path)
-    assert max(ur10e.values(tmp_path).values()) < 0.015
-    (tmp_path / ur10e.LEARNT[0]).write_text("1,2\n" * 700)
-    with pytest.raises(InputError, match="12harm"):
-        ur10e.values(tmp_path)

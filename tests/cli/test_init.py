@@ -22,7 +22,7 @@ pytestmark = pytest.mark.serial  # nothing here knows of ranks
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
 
 
-def errors(data: object) -> list[str]:
+def errors(data):
     """Return what the schema finds wrong, as an editor would."""
     schema = scene_schema()
     jsonschema.Draft7Validator.check_schema(schema)

@@ -1,13 +1,12 @@
 """Pieces that share faces, contacts that do not, and designs rated without these."""
 
 import json
-from copy import copy
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import built_of, dense_matrices
+from remainders import built_of
 from runs import TWO_ARM, overrides, run
 from solids import grid, sixths, solid_arm
 
@@ -57,15 +56,6 @@ def test_drawings(rows, pieces, corners, kept, joins):
     assert one.joins == joins and not (one.kept & ~solid).any()
     assert one.remaining == 0
     assert one.left_out == pytest.approx(1.0 - one.kept.sum() / solid.sum())
-
-
-@pytest.mark.serial
-def test_the_order_of_cells_does_not_matter():
-    cells, solid = drawn("######", "#..###", "###..#", "######")
-    order = np.random.default_rng(0).permutation(len(cells))
-    one, other = found(cells, solid), found(cells[order], solid[order])
-    assert np.array_equal(one.kept[order], other.kept)
-    assert np.array_equal(one.places, other.places) and one.places.tolist() == [[0.75, 0.5]]
 
 
 @pytest.mark.serial
@@ -207,76 +197,6 @@ def test_why_there_is_no_crisp_design(solid, contacts):
     assert len(told) == 1 + contacts
     assert ("contacts alone" in told[-1]) == bool(contacts)
     assert ("too weak" in told[-1]) == (not contacts)
-
-
-def compliance(arm, solid, split):
-    """Return f'u of unit loads at the outboard end, cells at contacts with nodes of their own."""
-    operators, T = arm.substructure.operators, arm.substructure.T
-    cells, points = operators.cells.copy(), list(operators.points)
-    for node in np.flatnonzero(~(T.inboard | T.outboard)) if split else ():
-        at = np.flatnonzero(solid & (cells == node).any(axis=1))
-        if len(at) == 2 and len(np.intersect1d(*cells[at])) == 1:
-            cells[at[1]] = np.where(cells[at[1]] == node, len(points), cells[at[1]])
-            points.append(points[node])
-    elastic = arm.state(solid * 1.0).elastic
-    own = copy(operators)
-    own.cells, own.points = cells, np.array(points)
-    K, _ = dense_matrices(SimpleNamespace(operators=own, mesh=arm.mesh), elastic.young, solid)
-    inverse = np.linalg.inv(K)
-    return inverse[-2, -2] + inverse[-1, -1]  # a force across, a moment
-
-
-@pytest.mark.serial
-def test_what_is_opened_is_as_soft_as_split_nodes():
-    """Against matrices put together here; the contact alone makes the truss stiff."""
-    scene = do.load_scene(TWO_ARM, (*QUICK, "arms.cells=[24,8]", "arms.height=0.2"))
-    arm = Arm(scene, 0, MPI.COMM_SELF, do.Profile())
-    i, j = (arm.mesh.centroid * [24.0, 40.0] + [0.0, 4.0]).astype(int).T
-    bars, posts = (j == 0) | (j == 7), (i == 0) | (i == 23)
-    steps = [(j == k) & (i >= 3 * k - 1 + (k == 4)) & (i <= 3 * k + 2) for k in range(1, 7)]
-    solid = np.any([bars, posts, *steps], axis=0)  # a brace of two cells, once joined by a corner
-    found = arm.contacts(solid)
-    assert found.joins and found.corners == 1 and found.remaining == 0
-    joined, split = (compliance(arm, solid, one) for one in (False, True))
-    assert split > 4.0 * joined
-    assert compliance(arm, found.kept, False) == pytest.approx(split, rel=2e-3)
-
-
-LINK = {
-    "name": "link",
-    "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},
-    "arms": [{"name": "link", "length": 0.3, "height": 0.06, "thickness": 0.04,
-              "cells": [30, 6, 4], "passive": 0.01}],
-    "joints": [{"name": "swing", "type": "revolute", "parent": "ground", "child": "link",
-                "axis": [0, 0, 1]}],
-    "motion": {"path": "joints", "file": "swing.csv", "horizon": 0.3},
-    "payload": {"mass": 1.0},
-    "reduction": {"coordinates": 8},
-    "objective": {"kind": "mass", "loads": [[0, 100.0, 0, 0, 0, 0], [0, 0, 60.0, 0, 0, 0],
-                                            [0, 0, 0, 5.0, 0, 0]]},
-    "constraints": {"tip_deflection": 6e-5},
-    "design": {"initial": 0.5, "filter_radius": 0.015, "projection": "heaviside",
-               "continuation": 8, "sharpness": 64.0},
-    "optimizer": {"max_iterations": 200},
-}  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.serial
-def test_the_lightest_link(tmp_path):
-    """With a filter of 1.5 cells it hangs by edges; the robust one is a single piece."""
-    (tmp_path / "swing.csv").write_text("t,swing\n0,0\n0.2,1\n")
-    robust = ("design.projection=robust", "design.erosion=0.25", "design.filter_radius=0.02")
-    for changes in ((), robust):
-        scene = do.scene_from_dict(LINK, str(tmp_path / "link.toml"), changes)
-        result = do.optimize(scene)
-        one = result.arms[0].contacts(result.x_phys[0] > 0.5)
-        assert one.corners == 0 and not result.violated
-        if changes:
-            assert (one.pieces, one.edges, one.left_out) == (1, 0, 0.0) and one.joins
-            assert result.crisp.objective == pytest.approx(result.evaluation.objective, rel=0.03)
-        else:
-            assert one.pieces > 5 and one.edges > 20 and one.left_out > 0.05
 
 
 @pytest.mark.serial

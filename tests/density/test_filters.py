@@ -16,9 +16,6 @@ from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT = 1.0, 0.06  # m
-# Solves are backward stable and the matrix is well conditioned: 1 + 4 (r/dx)^2 + 4 (r/dy)^2, at
-# most 60 here. Measured: 2e-15.
-ROUNDING = 1e-13
 
 
 def arm(cells=(40, 6), comm=COMM, length=LENGTH, height=HEIGHT, passive=0.0):
@@ -40,20 +37,6 @@ def mesh():
     return arm(passive=0.1)
 
 
-@pytest.mark.parametrize("radius", [0.0, 1e-4, 0.0075, 0.03, 0.12])
-def test_constants_bounds_and_volume_are_kept(mesh, radius):
-    smooth = HelmholtzFilter(mesh, radius)
-    assert np.allclose(smooth.forward(np.full(mesh.num_cells, 0.3)), 0.3, rtol=ROUNDING)
-    x = rough(mesh.centroid)
-    y = smooth.forward(x)
-    low, high = COMM.allreduce(x.min(), MPI.MIN), COMM.allreduce(x.max(), MPI.MAX)
-    assert y.min() >= low - ROUNDING and y.max() <= high + ROUNDING
-    sums = np.array([mesh.area @ x, mesh.area @ y, mesh.area @ x**2, mesh.area @ y**2])
-    volume, filtered_volume, roughness, filtered_roughness = COMM.allreduce(sums)
-    assert filtered_volume == pytest.approx(volume, rel=ROUNDING)
-    assert filtered_roughness < roughness or radius == 0.0  # it does smooth
-
-
 def test_radius_zero_is_the_identity(mesh):
     smooth = HelmholtzFilter(mesh, 0.0)
     x = rough(mesh.centroid)
@@ -61,37 +44,6 @@ def test_radius_zero_is_the_identity(mesh):
         y = apply(x)
         assert np.array_equal(y, x)
         assert y is not x  # who changes the result keeps the design
-
-
-def point(refine):
-    """Return the error of the Green's function beyond its tip, of the peak."""
-    r, along = 0.05, 50 * refine + 1
-    mesh = arm(cells=(along, 1))
-    s = np.abs(mesh.centroid[:, 0] - 0.5 * LENGTH)
-    density = np.where(s < 1e-6, along / LENGTH, 0.0)  # 1/m
-    y = HelmholtzFilter(mesh, radius_of(r)).forward(density)
-    # exp(-s / r) / (2 r) with its images beyond the ends.
-    kernel = np.cosh((0.5 * LENGTH - s) / r) / (2.0 * r * np.sinh(0.5 * LENGTH / r))
-    return np.abs(y - kernel)[s > 0.5 * r].max(initial=0.0) * 2.0 * r
-
-
-def cosine(refine):
-    """Return the error of an eigenfunction: cos(k s) gives cos(k s) / (1 + r^2 k^2)."""
-    r, waves = 0.02, np.array([5.0 * np.pi / LENGTH, 2.0 * np.pi / HEIGHT])
-    mesh = arm(cells=(25 * refine, 4 * refine))
-    x = np.cos((mesh.centroid + np.array([0.0, 0.5 * HEIGHT])) * waves).prod(axis=1)
-    y = HelmholtzFilter(mesh, radius_of(r)).forward(x)
-    return np.abs(y - x / (1.0 + r**2 * (waves**2).sum())).max(initial=0.0)
-
-
-@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
-@pytest.mark.parametrize("field", [point, cosine])
-def test_filter_converges_with_the_mesh(field):
-    """Order 2 in the cell size; measured 1.83 and 1.86, coarse meshes included."""
-    errors = [COMM.allreduce(field(refine), MPI.MAX) for refine in (1, 2, 4, 8)]
-    rate = -np.polyfit(np.arange(4) * np.log(2.0), np.log(errors), 1)[0]
-    assert errors[-1] < 6e-4  # 1.5e-4 and 4.7e-4
-    assert 1.75 < rate < 2.25
 
 
 # -- cells of any shape ----------------------------------------------------------------------
@@ -172,25 +124,6 @@ def test_second_moments_are_those_of_the_cone(kind):
     y = HelmholtzFilter(mesh, radius).forward(x) * mesh.area
     moments = COMM.allreduce(np.einsum("n,ni,nj->ij", y, away, away)) / (radius**2 / 6.0)
     assert moments == pytest.approx(np.eye(2), abs=5e-3)
-
-
-@pytest.mark.serial  # ranks: test_ranks_agree_on_any_mesh
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind not in ORTHOGONAL])
-def test_bounds_on_skew_cells(kind):
-    """A crisp disc: no cell beyond [0, 1] from a radius of two cells on; less than 4 % below.
-
-    Cells here are up to 1.6 times (graded) or 1.5 times (random) as large as the mean one.
-    """
-    mesh = square(kind, 40)
-    x = (np.hypot(*(mesh.centroid - 0.5).T) < 0.2).astype(float)
-
-    def beyond(cells):
-        y = HelmholtzFilter(mesh, cells / 40.0).forward(x)
-        return COMM.allreduce(max(-y.min(initial=0.0), y.max(initial=0.0) - 1.0), MPI.MAX)
-
-    assert beyond(2.0) < 1e-3
-    assert beyond(3.0) < 1e-12
-    assert 1e-4 < beyond(0.5) < 0.04
 
 
 @pytest.mark.skipif(COMM.size == 1, reason="needs two ranks")

@@ -152,21 +152,6 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
 
 
 @pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize(("name", "place"), [("thin webs", None), ("neck", (0.5, 0.0))])
-def test_the_place_of_the_thinnest_member(name, place):
-    corners, i, j = cells()
-    (solid,) = (one[1](i, j) for one in DRAWN if one[0] == name)
-    member, _ = thinnest(corners, solid)
-    x, y = member.place
-    assert solid[np.argmin(np.hypot(*(corners.mean(axis=1) - member.place).T))]
-    if place is None:  # in one of the webs, which stand every 20 cells
-        assert (x / CELL) % 20.0 < 1.0 and 3.0 < y / CELL < 9.0
-    else:
-        assert x == pytest.approx(100.5 * CELL, abs=CELL) and y == pytest.approx(0.03, abs=CELL)
-    assert member.to == pytest.approx(CELL / 4.0)
-
-
-@pytest.mark.serial  # ranks have no part in it
 def test_widths_of_solids():
     """A web of two cells over a window of four, in boxes and in tetrahedra; to a voxel."""
     boxes, places = grid(10, 9, 3, step=CELL)
@@ -190,17 +175,6 @@ def test_widths_of_solids():
     assert none is None and whole.size == pytest.approx(3.0 * CELL, abs=CELL / 4.0)
 
 
-@pytest.mark.serial  # ranks have no part in it
-def test_a_rod_between_blocks() -> None:
-    """Blocks six times as thick, whose edges are as wide as the rod, do not hide it."""
-    boxes, places = grid(36, 12, 12, step=CELL)
-    i, j, k = places.T
-    rod = (abs(j - 5.5) < 1.0) & (abs(k - 5.5) < 1.0)
-    member, _ = thinnest(boxes, (i < 12) | (i >= 24) | rod, CELL)
-    assert member.size == pytest.approx(2.0 * CELL, abs=1.001 * CELL / 4.0)
-    assert 12.0 < member.place[0] / CELL < 24.0
-
-
 @pytest.mark.serial
 @pytest.mark.parametrize(("volume", "misses"), [(0.5, False), (0.3, True)])
 def test_widths_that_are_missed_are_told(volume, misses, tmp_path, capsys):
@@ -222,27 +196,6 @@ def test_widths_that_are_missed_are_told(volume, misses, tmp_path, capsys):
         x, y = one["place"]
         assert f"at ({x:.4g}, {y:.4g}) m" in text and "raise design.sharpness" in text
         assert text in printed.err
-
-
-@pytest.mark.slow
-@pytest.mark.serial  # ranks have no part in it
-def test_a_gap_of_its_own_widens_the_gaps():
-    """Gaps of a nearly full arm are as wide as asked, and members beside them."""
-    full = ("design.volume_fraction=0.75", "design.initial=0.75", "design.minimum_member=0.01")
-    more = ("design.erosion=0.25", "design.sharpness=64", "design.continuation=10")
-    cell, gaps = 0.06 / 18, []
-    for gap in (0.0, 0.02):
-        changes = (*ROBUST, *full, *more, f"design.minimum_gap={gap}")
-        scene = do.load_scene(TWO_ARM, (*changes, "optimizer.max_iterations=120"))
-        result = do.optimize(scene)
-        widths = _widths(result.partition, result.arms, result.x_phys)
-        if WORLD.rank == 0:
-            member, found = widths[0]
-            assert member.size >= 0.01 - cell
-            gaps.append(0.06 if found is None else found.size)  # none is narrower than the arm
-    if WORLD.rank == 0:
-        # Where a slot meets the outboard interface it is a cell narrower at either side.
-        assert gaps[1] >= 0.02 - 2.0 * cell * (1.0 + 1e-9)
 
 
 @pytest.mark.parametrize("width", [0.012, 0.0])

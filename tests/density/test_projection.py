@@ -2,11 +2,9 @@
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from dolfinopt.density.filter import project, robust_thresholds
 
-COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 X = np.concatenate([np.linspace(0.0, 1.0, 201), [1e-12, 1e-3, np.nextafter(1.0, 0.0)]])
 X.sort()
 ETAS = [0.0, 0.1, 0.4, 0.5, 0.7, 1.0]
@@ -35,18 +33,6 @@ def test_bounds_and_order_are_kept(beta, eta):
     assert (y.value >= 0.0).all() and (y.value <= 1.0).all()
     assert (np.diff(y.value) > -4e-16).all()  # some units of rounding of 1
     assert np.isfinite(y.slope).all() and (y.slope >= 0.0).all()
-
-
-@pytest.mark.serial
-def test_no_sharpness_is_the_identity():
-    """For eta = 1/2, y = x + beta^2 x (1 - x) (2 x - 1) / 6 and terms of fourth order."""
-    same = project(X, 0.0, 0.3).value
-    assert np.array_equal(same, X) and not np.shares_memory(same, X)
-    assert np.array_equal(project(X, 0.0, 0.3).slope, np.ones_like(X))
-    assert project(X, 1e-9, 0.3).value == pytest.approx(X, abs=1e-15)
-    assert project(X, 1e-9, 0.3).slope == pytest.approx(1.0, abs=2e-15)
-    second = X * (1.0 - X) * (2.0 * X - 1.0) / 6.0
-    assert project(X, 0.01, 0.5).value - X == pytest.approx(1e-4 * second, abs=1e-9)
 
 
 @pytest.mark.serial

@@ -17,7 +17,6 @@ from dolfinopt.scene.load import Arm as Entry
 COMM = MPI.COMM_WORLD
 BORES = str(mesh_folder() / "arm_bores.geo")
 SCENE = ROOT / "demos" / "two_arm_bores.toml"
-EPS = np.finfo(float).eps
 
 
 def bores(shape, **keys):
@@ -36,13 +35,6 @@ MESHES = {
 @pytest.fixture(scope="module", params=MESHES)
 def mesh(request):
     return MESHES[request.param]()
-
-
-def scattered():
-    """Return a mesh with centroids off their places, so that mirror images are no pairs."""
-    mesh = box_arm(COMM, "a", (1.0, 0.5), (20, 10))
-    off = 0.02 * np.sin(mesh.centroid @ [[900.0, 310.0], [470.0, 850.0]])
-    return dataclasses.replace(mesh, centroid=mesh.centroid + off)
 
 
 def symmetric(mesh):
@@ -70,60 +62,11 @@ def test_field_becomes_the_mean_of_itself_and_its_mirror_image(mesh):
     assert after == pytest.approx(before, rel=1e-8)  # areas of a pair agree to 1e-9
 
 
-@pytest.mark.parametrize("pairs", [True, False])
-def test_backward_is_the_transpose(mesh, pairs):
-    """Also where the map to the nearest cell is no pairing."""
-    mesh = mesh if pairs else scattered()
-    symmetry = symmetric(mesh)
-    matrix = mirrored(mesh)
-    assert pairs == (abs(matrix - matrix.T).max() == 0.0)
-    x, w = wave(mesh.centroid), np.cos(90.0 * mesh.centroid[:, 0] - 33.0 * mesh.centroid[:, 1])
-    forward, backward = symmetry.forward(x), symmetry.backward(w)
-    left, right, size = COMM.allreduce(np.array([w @ forward, backward @ x, np.abs(w) @ forward]))
-    assert abs(left - right) < 100.0 * EPS * size  # sums of some hundred terms
-
-
 def test_mesh_without_symmetry_is_refused():
     mesh = box_arm(COMM, "a", (1.0, 0.06), (20, 4))
     above = dataclasses.replace(mesh, centroid=mesh.centroid + np.array([0.0, 0.03]))
     with refused("no mirror image", "1.25 cell"):
         symmetric(above)
-
-
-GRADED = """h = 0.03;
-Point(1) = {0, -h, 0, 0.02}; Point(2) = {0.5, -h, 0, 0.02};
-Point(3) = {0.5, h, 0, 0.003}; Point(4) = {0.3, h, 0, 0.003};
-Point(5) = {0.25, h - NOTCH, 0, 0.003};
-Point(6) = {0.2, h, 0, 0.003}; Point(7) = {0, h, 0, 0.003};
-Line(1) = {1, 2}; Line(2) = {2, 3}; Line(3) = {3, 4}; Line(4) = {4, 5}; Line(5) = {5, 6};
-Line(6) = {6, 7}; Line(7) = {7, 1};
-Curve Loop(1) = {1:7}; Plane Surface(1) = {1};
-Physical Curve("inboard") = {7}; Physical Curve("outboard") = {2};
-"""
-
-
-@pytest.mark.parametrize("notch", [0.0, 0.03])
-def test_cells_need_not_be_symmetric_where_the_arm_is(notch, shared_tmp_path):
-    """Cells six times as large below as above: fields become even as far as cells tell."""
-    path = shared_tmp_path / "graded.geo"
-    if COMM.rank == 0:
-        path.write_text(GRADED.replace("NOTCH", str(notch)))
-    COMM.barrier()
-    entry = Entry(name="a", mesh=str(path), length=0.5, height=0.06, thickness=0.01,
-                  cell_shape="triangle")  # fmt: skip
-    mesh = arm_mesh(COMM, entry)
-    if notch:
-        with refused("symmetric, but", "has no mirror image", "correct the geometry"):
-            symmetric(mesh)
-        return
-    symmetry = symmetric(mesh)
-    y = symmetry.forward(10.0 * mesh.centroid[:, 1])
-    # Of the odd field nothing is left but what cells of 20 mm blur; before it is 0.3.
-    assert np.abs(y).max() < 0.08
-    x, w = wave(mesh.centroid), np.cos(90.0 * mesh.centroid[:, 0])
-    pair = np.array([w @ symmetry.forward(x), symmetry.backward(w) @ x])
-    left, right = COMM.allreduce(pair)
-    assert left == pytest.approx(right, rel=1e-12)
 
 
 # --- in an arm -------------------------------------------------------------------------------
@@ -145,17 +88,3 @@ def test_chain_is_the_transpose_of_physical(shape):
     physical = arm.physical(x)
     assert np.allclose(symmetric(arm.mesh).forward(physical), physical, atol=1e-9)
     assert (physical[arm.mesh.passive] == 1.0).all()
-
-
-def test_optimised_design_is_symmetric():
-    overrides = ["arms.mesh_size=0.012", "optimizer.max_iterations=3", "motion.elbow=1"]
-    result = do.optimize(do.load_scene(SCENE, overrides))
-    for k, arm in result.arms.items():
-        x = result.x_phys[k]
-        assert np.allclose(symmetric(arm.mesh).forward(x), x, atol=1e-9)
-        assert np.ptp(x) > 0.5  # there is a design
-        assert (x[arm.mesh.passive] == 1.0).all()
-    if COMM.rank == 0:
-        objectives = [row.objective for row in result.history]
-        assert objectives[-1] < 0.5 * objectives[0]
-        assert result.history[-1].volume_fraction < 0.5

@@ -1,8 +1,5 @@
 """Beams that are spun up: the standard test of geometric stiffening."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +11,7 @@ from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals, shape_integrals
+from dolfinopt.multibody.shape_integrals import shape_integrals
 from dolfinopt.profiling import Profile
 from dolfinopt.reduction import METHODS, Options
 
@@ -24,9 +21,7 @@ REFERENCE = Path(__file__).parents[2] / "benchmarks" / "reference"
 RUN_UP = 15.0  # s
 
 
-def cells_beam(
-    length: float, area: float, bending: float, axial: float, line_mass: float
-) -> ShapeIntegrals:
+def cells_beam(length, area, bending, axial, line_mass):
     """Return a beam of EI (N m2), EA (N), rho A (kg/m) as a floating body of plane cells, nu = 0.
 
     Its section is a rectangle whose height follows from EI / EA.
@@ -40,11 +35,11 @@ def cells_beam(
     return shape_integrals(design, basis, 0.0, unit_loads(design))
 
 
-def spun_up(speed: float) -> Callable[[np.ndarray], RigidMotion]:
+def spun_up(speed):
     """Return the motion whose angular velocity grows to `speed`, rad/s, as t - sin, in 15 s."""
     a = 2.0 * np.pi / RUN_UP
 
-    def motion(t: np.ndarray) -> RigidMotion:
+    def motion(t):
         on = t < RUN_UP
         angle = np.where(on, speed / RUN_UP * (0.5 * t * t + (np.cos(a * t) - 1.0) / a**2), 0.0)
         angle += np.where(on, 0.0, speed * (t - 0.5 * RUN_UP))
@@ -56,7 +51,7 @@ def spun_up(speed: float) -> Callable[[np.ndarray], RigidMotion]:
     return motion
 
 
-def tip(body: ShapeIntegrals, speed: float, t: np.ndarray) -> np.ndarray:
+def tip(body, speed, t):
     """Return axial and transverse deflection (n, 2) of the tip in the rotating frame, m."""
     mechanism = plane_chain((body,), 0.0, 0.0, (0.0, 0.0), 0.0)
     system = MachineSystem(mechanism, spun_up(speed), (0.0, RUN_UP, float(t[-1])))
@@ -66,13 +61,13 @@ def tip(body: ShapeIntegrals, speed: float, t: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def slender() -> ShapeIntegrals:
+def slender():
     """Return the beam of Wu & Haug (1988), doi:10.1080/08905458808960262."""
     E, A, inertia, rho = 6.8952e10, 7.2968e-5, 8.2189e-9, 2766.67
     return cells_beam(8.0, A, E * inertia, E * A, rho * A)
 
 
-def test_wu_and_haug(slender: ShapeIntegrals) -> None:
+def test_wu_and_haug(slender):
     """Against geometrically exact beams, checked by refinement (Exudyn): `reference/README.md`."""
     table = np.loadtxt(REFERENCE / "spin_up.csv", delimiter=",", skiprows=1)
     found = tip(slender, 4.0, table[:, 0])
@@ -83,7 +78,7 @@ def test_wu_and_haug(slender: ShapeIntegrals) -> None:
     assert found[found[:, 1].argmin(), 0] == pytest.approx(-0.020464, rel=2e-3)
 
 
-def test_simo_and_vu_quoc() -> None:
+def test_simo_and_vu_quoc():
     """Least tip deflection -0.574 m near 6.76 s, steady stretch 5.14e-4 m.
 
     Simo & Vu-Quoc (1987), doi:10.1016/0045-7825(87)90170-6, six modes of an Euler-Bernoulli beam.

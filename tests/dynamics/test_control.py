@@ -1,26 +1,19 @@
-"""Machines under control: against geometrically exact beams, energy, stiff limits, soft joints."""
-
-from __future__ import annotations
+"""Machines under control: against geometrically exact beams, saturation, soft joints."""
 
 import numpy as np
 import pytest
 from machines import (
     GAINS,
-    Tree,
     apart,
-    check_energy,
-    four_bar,
     machine,
     reference,
     simulated,
-    slider_crank,
     two_arm,
     with_keys,
 )
 from machines import small_two_arm as small
 from runs import TWO_ARM, overrides, run
 
-from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.drives import saturated
 from dolfinopt.dynamics.measured import LINEAR_DRIVE_SHARE
 from dolfinopt.dynamics.system import relative_error
@@ -34,7 +27,7 @@ SOFT = {"joint_stiffness": 1e5, "joint_damping": 100.0}
 ROTORS = {"rotor_inertia": 2e-5, "gear_ratio": 100.0}
 
 
-def test_deviation_and_forces_of_exact_beams() -> None:
+def test_deviation_and_forces_of_exact_beams():
     """Exudyn's beams with the same controller, and a second code: `reference/README.md`."""
     tree = two_arm("arms.cells=[100,6]", "reduction.coordinates=6", control=GAINS)
     simulation = {"stiffening": True, "sample": 1e-2, "tolerance": 1e-5}
@@ -57,7 +50,7 @@ def test_deviation_and_forces_of_exact_beams() -> None:
 
 
 @pytest.mark.parametrize(("stiffening", "least", "most"), [(True, 0.0, 4e-3), (False, 1e-2, 3e-2)])
-def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: float) -> None:
+def test_prescribed_arms_of_exact_beams(stiffening, least, most):
     """Fast arms with 0.5 kg: linear they are 2.0 % off, stiffened 0.39 %; `reference/README.md`."""
     expected = reference("two_arm_half_T0.9_0.5kg")
     motion = {"duration": 0.9, "horizon": float(expected["t"][-1])}
@@ -72,21 +65,21 @@ def test_prescribed_arms_of_exact_beams(stiffening: bool, least: float, most: fl
     assert least < off < most
 
 
-def arms(stiffening: bool, **changes: object) -> Tree:
+def arms(stiffening, **changes):
     """Return the machine with motors at its joints under gravity, without control unless told."""
     simulation = {"stiffening": stiffening, "tolerance": 1e-6}
     tree = small({"joint_mass": 0.5, "joint_inertia": 0.01}, motion=EARTH, simulation=simulation)
     return {**tree, "control": None, **changes}
 
 
-def test_friction_while_a_joint_turns_round() -> None:
+def test_friction_while_a_joint_turns_round():
     """Feed-forward's jump and friction's leave a pulse of 0.3 ms, which steps must not miss.
 
     Unless a step ends there the error was twelve times the tolerance, the estimate 0.4 times.
     """
     friction = {"friction": [0.0, 5.0], "friction_speed": 1e-3}
 
-    def solved(tolerance: float) -> Trajectory:
+    def solved(tolerance):
         found = simulated(small(friction, control=GAINS, simulation={"tolerance": tolerance}))
         assert found.trajectory is not None
         return found.trajectory
@@ -98,62 +91,7 @@ def test_friction_while_a_joint_turns_round() -> None:
     assert error < 1e-5  # 2e-7
 
 
-def loop(tree: Tree) -> Tree:
-    """Return a closed loop of soft bars under gravity."""
-    tree["material"]["young_modulus"] *= 0.1
-    keys = {"simulation": {"tolerance": 1e-6}, "reduction": {"coordinates": 3}}
-    return with_keys(tree, {**keys, "motion": {**STRONG, "horizon": 0.1}})
-
-
-SCENES = {
-    "prescribed": lambda: arms(False),
-    "prescribed, stiffened": lambda: arms(True),
-    "controlled": lambda: arms(False, control=GAINS),
-    "controlled, stiffened": lambda: arms(True, control=GAINS),
-    "slider": lambda: loop(slider_crank(0.012, (20, 3))),
-    "pin": lambda: loop(four_bar((20, 3))),
-}
-
-
-@pytest.mark.parametrize("kind", SCENES)
-def test_work_under_gravity_is_energy(kind: str) -> None:
-    """Drive work = kinetic + strain + potential energy + what damping took."""
-    check_energy(simulated(SCENES[kind]()), 1e-8)  # measured 2e-11 at most
-
-
-def test_stiff_springs_are_rigid_drives() -> None:
-    """The motors' inertia acts on the joints then; the rest falls with the spring's softness."""
-    rigid = machine(simulated(small(ROTORS, motion=EARTH)))[0]
-    left = []
-    for stiffness in (2e6, 2e7):
-        spring = {"joint_stiffness": stiffness, "joint_damping": 1e-3 * stiffness}
-        soft = machine(simulated(small(ROTORS | spring, motion=EARTH)))[0]
-        assert soft.problem.num_coordinates == rigid.problem.num_coordinates + 2
-        left.append(apart(soft.deviation, rigid.deviation))
-    assert left[0] / left[1] == pytest.approx(10.0, rel=0.05)
-    assert left[1] < 5e-3  # the joints' own springs are a thousandth of this
-
-
-def test_motors_on_the_desired_motion_move_their_rotors() -> None:
-    """Without control the drives give what the springs take, and what the rotors' inertia does.
-
-    The cart carries the only rotor, whose own moment turns nothing.
-    """
-    motions = []
-    for one in (0.0, 2e-5):
-        tree = small(SOFT | ROTORS | {"rotor_inertia": 0.0}, control=None)
-        tree["arms"][0]["rotor_inertia"] = one
-        motions.append(simulated(tree).trajectory)
-    light, heavy = motions
-    np.testing.assert_array_equal(heavy.deviation, light.deviation)  # the arms do not feel it
-    change = heavy.joint_forces - light.joint_forces
-    expected = 2e-5 * 100.0**2 * heavy.desired.qdd
-    expected[:, [0, 2]] = 0.0  # the cart is prescribed, and moved by what the arms do
-    size = np.abs(heavy.joint_forces).max()
-    np.testing.assert_allclose(change, expected, rtol=0, atol=1e-12 * size)
-
-
-def test_angles_of_motors_are_written(tmp_path) -> None:
+def test_angles_of_motors_are_written(tmp_path):
     """At rest under gravity the drives give what the springs between motor and arm give."""
     gains = "control={stiffness=[2e5, 2e4, 2e4], damping=[2e4, 600.0, 600.0]}"
     joints = (f"arms.{key}={value}" for key, value in (SOFT | ROTORS).items())
@@ -167,7 +105,7 @@ def test_angles_of_motors_are_written(tmp_path) -> None:
     assert "q_motor_arm1,q_motor_arm2" in header
 
 
-def test_saturation_is_linear_to_95_percent_and_smooth() -> None:
+def test_saturation_is_linear_to_95_percent_and_smooth():
     """As wanted within the limit, the limit beyond; derivative right, continuous to the second."""
     limit = np.array([40.0])
     within = limit * np.array([[-LINEAR_DRIVE_SHARE], [0.0], [0.3], [LINEAR_DRIVE_SHARE]])
@@ -186,7 +124,7 @@ def test_saturation_is_linear_to_95_percent_and_smooth() -> None:
     assert np.abs(np.diff(bend, axis=0)).max() < 60.0 * h / 4.0**2
 
 
-def lifting(mass: float, limits: list[float] | None) -> Tree:
+def lifting(mass, limits):
     """Return a robot of two links that lifts its payload, its drives as its data sheet has them."""
     bar = {"height": 0.1, "thickness": 0.02, "cells": [16, 3], "passive": 0.0}
     gains = {"stiffness": [2e4, 1e4], "damping": [600.0, 200.0]}
@@ -200,7 +138,7 @@ def lifting(mass: float, limits: list[float] | None) -> Tree:
     return with_keys(robot, {"motion": motion, "payload": {"mass": mass}})
 
 
-def test_robot_within_its_data_sheet() -> None:
+def test_robot_within_its_data_sheet():
     """Drives that need less than 95 % of their limits do as drives without; others are cut off."""
     limits = [330.0, 150.0]  # N m
     free, held = (machine(simulated(lifting(18.0, one)))[0] for one in (None, limits))

@@ -1,27 +1,19 @@
-"""Forces on interfaces, [[forces]]: closed forms, energy, control, batches."""
-
-from __future__ import annotations
+"""Forces on interfaces, [[forces]]: closed forms and control."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from machines import energies, fork, trajectory_of, two_arm, with_keys
-from runs import scene
+from machines import fork, trajectory_of, two_arm, with_keys
 
-import dolfinopt as do
-from dolfinopt.dynamics.build import simulate_all
-from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.profiling import Profile
-from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial
 ANGLE = 0.7  # rad, at which the arm is held
 LENGTH, HEIGHT, THICKNESS, MODULUS = 1.0, 0.02, 0.01, 70e9
 
 
-def held(folder: Path, *forces: dict, **changes) -> Scene:
+def held(folder, *forces, **changes):
     """Return one arm of solid material that its joint holds at `ANGLE`."""
     (folder / "held.csv").write_text(f"t,arm\n0,{ANGLE}\n0.1,{ANGLE}\n")
     tree = {
@@ -42,7 +34,7 @@ def held(folder: Path, *forces: dict, **changes) -> Scene:
     ("force", "moment", "frame"),
     [((0.0, 2.0), 0.0, "arm"), ((0.0, 0.0), 1.5, "world"), ((0.0, -3.0), 1.0, "world")],
 )
-def test_cantilever_bends_by_the_closed_form(force, moment, frame, tmp_path) -> None:
+def test_cantilever_bends_by_the_closed_form(force, moment, frame, tmp_path):
     """Tip and joint of Timoshenko's beam, F L^3 / 3 E I + F L / k G A + M L^2 / 2 E I."""
     one = held(tmp_path, {"arm": "arm", "force": force, "moment": moment, "frame": frame})
     found = trajectory_of(one)
@@ -59,7 +51,7 @@ def test_cantilever_bends_by_the_closed_form(force, moment, frame, tmp_path) -> 
     assert found.joint_forces[0, 1] == pytest.approx(torque, rel=1e-9)
 
 
-def test_force_along_the_arm_stiffens_it(tmp_path) -> None:
+def test_force_along_the_arm_stiffens_it(tmp_path):
     """Pulled by P, a cantilever bends by F / P (L - tanh(kL) / k), k^2 = P / EI."""
     # Timoshenko & Gere, Theory of Elastic Stability (1961), sec. 1.11.
     pull, across = 400.0, 1.0
@@ -75,43 +67,7 @@ def test_force_along_the_arm_stiffens_it(tmp_path) -> None:
     assert tip.imag == pytest.approx(exact, rel=1e-3)
 
 
-def test_work_of_forces_is_energy(tmp_path) -> None:
-    """Drives and forces, of the world over time and of the arm, by the places of interfaces."""
-    table = tmp_path / "push.csv"
-    table.write_text("t,fx,fy,mz\n0,0,0,0\n0.8,30,-10,4\n1.6,-20,30,0\n3,0,0,0\n")
-    forces = [
-        {"arm": "arm1", "table": str(table), "moment": 2.0},
-        {"arm": "arm2", "force": [5.0, 20.0], "moment": -1.0, "frame": "arm"},
-    ]
-    changes = ("arms.cells=[16,2]", "simulation.tolerance=1e-5", "simulation.stiffening=true")
-    tree = two_arm(*changes) | {"forces": forces}
-    found = trajectory_of(scene_from_dict(tree))
-    nodes, weights = np.polynomial.legendre.leggauss(6)
-    grid, mechanism = found.solution.time_grid, found.mechanism
-    h = np.diff(grid)[:, None]
-    t = (grid[:-1, None] + 0.5 * h * (nodes + 1.0)).ravel()
-    seen = found.at(t)
-    power = (seen.joint_forces * seen.motion.qd).sum(axis=1)
-    qd = found.solution.sample(t, 1)
-    for part, body in zip(mechanism.slices, mechanism.bodies, strict=True):
-        power -= np.einsum("ni,ij,nj->n", qd[:, part], body.D, qd[:, part])
-    step = 1e-5  # s, of central differences
-    poses = [found.at(t + sign * step) for sign in (0.0, 1.0, -1.0)]
-    for force in mechanism.forces:
-        now, after, before = (Posed(mechanism, one.motion.q, one.q_e) for one in poses)
-        F, M = seen.motion.applied[:, force.column, :2].T, seen.motion.applied[:, force.column, 2]
-        R = now.body(force.site[0])[2]
-        F = F if force.in_world else np.einsum("ijn,jn->in", R, F)
-        (p, Q), (q, S) = (pose.interface(*force.site) for pose in (after, before))
-        turned = np.arctan2(*reversed(np.einsum("ijn,ikn->jkn", S, Q)[:, 0]))
-        power += ((p - q) * F).sum(axis=0) / (2.0 * step) + M * turned / (2.0 * step)
-    work = np.cumsum((0.5 * h * weights * power.reshape(len(h), -1)).sum(axis=1))
-    stored = sum(energies(found, grid))
-    assert np.abs(work).max() > 0.1 * np.abs(stored).max()
-    assert np.abs(work - (stored[1:] - stored[0])).max() < 1e-5 * np.abs(stored).max()
-
-
-def test_feed_forward_knows_forces_unless_they_are_disturbances(tmp_path) -> None:
+def test_feed_forward_knows_forces_unless_they_are_disturbances(tmp_path):
     """A moment that the control foresees leaves no error at the start, another one M / k."""
     push = {"arm": "arm2", "moment": 20.0}
     quick = ("arms.cells=[8,2]", "motion.horizon=2.0")
@@ -128,22 +84,7 @@ def test_feed_forward_knows_forces_unless_they_are_disturbances(tmp_path) -> Non
             assert error == pytest.approx([20.0 / 2e4, 20.0 / 2e4], rel=1e-9)
 
 
-def test_scenarios_of_forces_are_simulated_together() -> None:
-    """A batch of other forces, on a motion that the scenes share, is what each is by itself."""
-    quick = ("arms.cells=[8,2]", "motion.horizon=2.0", "simulation.tolerance=1e-6")
-    scenes = [scene(*quick, f'forces=[{{arm="arm2", force=[{x}, 2.0]}}]') for x in (5.0, -9.0)]
-    scenes.append(scene(*quick))
-    bodies = list(do.Model(scenes[0]).simulate().trajectory.mechanism.bodies)
-    profile = Profile()
-    every = simulate_all(scenes, [bodies] * 3, profile)
-    for one, found in zip(scenes, every, strict=True):
-        (alone,) = simulate_all([one], [bodies], profile)
-        t = np.linspace(0.0, 2.0, 50)
-        a, b = found.at(t).deviation, alone.at(t).deviation
-        assert np.abs(a - b).max() < 1e-5 * np.abs(b).max()
-
-
-def test_link_between_pin_and_cylinder_bears_its_force(tmp_path) -> None:
+def test_link_between_pin_and_cylinder_bears_its_force(tmp_path):
     """The joint of a link that its second interface pushes, in space, by the rigid lever."""
     (tmp_path / "table.csv").write_text("t,swing,slide\n0,0,0\n0.2,0,0\n")
     tree = with_keys(fork(), {"motion": {"gravity": [0.0, 0.0, 0.0]}})

@@ -1,74 +1,56 @@
-"""The integrator against closed forms, itself with more stages, and its own estimate."""
+"""The integrator against itself with more stages, and its own estimate."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise, product
-from typing import Any
+from itertools import product
 
 import numpy as np
 import pytest
 from bodies import (
-    Chain,
     Cloud,
     assert_close,
     beam,
-    derivative,
-    plane_body,
     plane_chain,
-    random_cloud,
 )
 from machines import distance
 from remainders import build
-from scipy.integrate import solve_ivp
 
 from dolfinopt.dynamics import adjoint, march, measured, newton, newton_matrix, radau
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.dynamics.collocation import (
-    Solution,
-    Stages,
     Strategy,
-    at_stages,
-    residual_at,
-    stages_of,
 )
 from dolfinopt.dynamics.estimate import Estimate
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.modes import modes_of
 from dolfinopt.dynamics.newton import Iterate
-from dolfinopt.dynamics.newton_matrix import NewtonMatrix, factorise, matrix_of
+from dolfinopt.dynamics.newton_matrix import factorise, matrix_of
 from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.laws import Limits, law_for
 
 pytestmark = pytest.mark.serial  # arrays of one process
 
-Motion = Callable[[np.ndarray], RigidMotion]
 QUINTIC = law_for("quintic", 1.0, Limits(), 0.25)
 HOMES = np.array([0.0, 0.6, 0.8, -0.5])  # m, rad: where the motions begin
 ENDS = (0.0, 0.6, 1.0)  # s, of `reach`
 
 
-def swing(t: np.ndarray, size: tuple[float, ...] = (0.1, 0.5, -0.4)) -> RigidMotion:
+def swing(t, size=(0.1, 0.5, -0.4)):
     """Return harmonic motions that start without speed, smooth for ever."""
     w = np.array([3.0, 4.0, 5.0])  # rad/s
     s, c = np.sin(np.outer(t, w)), np.cos(np.outer(t, w))
     return RigidMotion(HOMES[:3] + size * (1.0 - c), size * w * s, size * w**2 * c)
 
 
-def still(t: np.ndarray) -> RigidMotion:
+def still(t):
     """Return no motion."""
     return swing(t, (0.0, 0.0, 0.0))
 
 
-def reach(t: np.ndarray, size: tuple[float, ...] = (0.2, 1.0, -0.8)) -> RigidMotion:
+def reach(t, size=(0.2, 1.0, -0.8)):
     """Return a quintic motion of that size over 0.6 s, then rest."""
     s, sd, sdd = QUINTIC(t, ENDS[1])
     home = np.resize(HOMES, len(size))
@@ -76,102 +58,32 @@ def reach(t: np.ndarray, size: tuple[float, ...] = (0.2, 1.0, -0.8)) -> RigidMot
 
 
 def two_arms(
-    motion: Motion = reach,
-    breakpoints: tuple[float, ...] = ENDS,
-    payload: float = 1.0,
-    bending: float = 10.0,
-    axial: float = 300.0,
-    damping: float = 1e-3,
-    gravity: tuple[float, float] = (0.0, 0.0),
-    arms: int = 2,
-) -> tuple[MachineSystem, Chain]:
-    """Return slender arms of 1 to 50 Hz, and the same as points with their energies."""
-    arm = beam(bending=bending, axial=axial, damping=damping)
-    chain = Chain((arm,) * arms, payload, 0.01, gravity, 0.0)
-    return MachineSystem(chain.mechanism(), motion, breakpoints), chain
+    motion=reach,
+    breakpoints=ENDS,
+    payload=1.0,
+    bending=10.0,
+    axial=300.0,
+    damping=1e-3,
+    arms=2,
+):
+    """Return slender arms of 1 to 50 Hz."""
+    arm = beam(bending=bending, axial=axial, damping=damping).body()
+    mechanism = plane_chain([arm] * arms, payload, 0.01, (0.0, 0.0), 0.0)
+    return MachineSystem(mechanism, motion, breakpoints)
 
 
-def oscillator(frequency: float, damping: float, motion: Motion, end: float) -> MachineSystem:
-    """Return one coordinate of that frequency (rad/s) and damping ratio that the cart pushes."""
-    none, one, tip = np.zeros(1), np.eye(1), np.array([1.0, 0.0])
-    C, D = tip[:, None], 2.0 * damping * frequency * one
-    shape = (none, none, one, 0.0 * one, frequency**2 * one, D, np.zeros((3, 1)), tip)
-    body = plane_body(1.0, np.zeros(2), 0.0, C, *shape)
-    return MachineSystem(plane_chain((body,), 0.0, 0.0, (0.0, 0.0), 0.0), motion, (0.0, PUSH, end))
-
-
-PUSH = 0.1  # s, when the cart begins to accelerate
-
-
-def pushed(t: np.ndarray) -> RigidMotion:
-    """Return a cart that accelerates by 1 m/s2 from `PUSH` on; the step that ends there rests."""
-    # An instant that a step's end misses by rounding belongs to the step.
-    on = np.where(t > PUSH + 1e-12, 1.0, 0.0)
-    late = on * (t - PUSH)
-    zero = np.zeros_like(t)
-    columns = [np.column_stack([x, zero]) for x in (0.5 * late**2, late, on)]
-    return RigidMotion(*columns)
-
-
-def solve(problem: MachineSystem, tolerance: float, stages: int = 3) -> Solution:
+def solve(problem, tolerance, stages=3):
     """Integrate from cold."""
     return radau.integrate(problem, tolerance, stages, Profile())
 
 
-@pytest.mark.parametrize("stages", [1, 2, 3, 4, 5])
-def test_radau_coefficients(stages: int) -> None:
-    """c_s = 1, B(2 s - 1) and C(s), which nothing else fulfils (Hairer & Wanner 1996, IV.5)."""
-    method = radau.radau_iia(stages)
-    c, A = method.c, method.A
-    assert c[-1] == pytest.approx(1.0, abs=1e-14) and len(c) == stages
-    for k in range(2 * stages - 1):
-        assert_close(A[-1] @ c**k, 1.0 / (k + 1), 1e-13)
-    for k in range(stages):
-        assert_close(A @ c**k, c ** (k + 1) / (k + 1), 1e-13)
-    assert_close(method.A2, A @ A, 1e-14)
-
-
-@pytest.mark.parametrize("damping", [0.0, 0.05])
-def test_step_response_of_an_oscillator(damping: float) -> None:
-    """q = -1/w^2 (1 - exp(-d w t) (cos w_d t + d / sqrt(1 - d^2) sin w_d t)) after the push."""
-    frequency, tolerance = 40.0, 1e-3
-    problem = oscillator(frequency, damping, pushed, 0.6)
-    solution = solve(problem, tolerance)
-    t = np.linspace(0.0, 0.6, 601)
-    late = np.maximum(t - PUSH, 0.0)
-    rest = np.sqrt(1.0 - damping**2)
-    phase = rest * frequency * late
-    decay = np.exp(-damping * frequency * late)
-    expected = -(1.0 - decay * (np.cos(phase) + damping / rest * np.sin(phase))) / frequency**2
-    assert_close(solution.sample(t)[:, 0], expected, tolerance)
-    assert solution.error <= tolerance
-
-
-def test_rest_under_gravity_is_static_equilibrium() -> None:
-    """Starts where the potential is stationary, and stays there."""
-    problem, chain = two_arms(still, (0.0, 0.5), gravity=(1.0, -9.81), damping=0.0)
-    q = problem.initial_state()[0][0]
-    unit = np.eye(6)
-
-    def potential(t: float) -> np.ndarray:
-        return np.array([chain.potential(np.append(HOMES[:3], q + t * e)) for e in unit])
-
-    slope = derivative(potential)
-    assert_close(slope, np.zeros(6), 1e-10, np.abs(problem.mechanism.stiffness() @ q).max())
-    assert np.abs(q).max() > 0.01  # m, rad: it does hang
-    solution = solve(problem, 1e-6)
-    t = np.linspace(0.0, 0.5, 51)
-    # Rounding of the forces sets off vibrations of its own size.
-    assert_close(solution.sample(t), np.broadcast_to(q, (51, 6)), 1e-9)
-
-
 def fitted_order(
-    problem: MachineSystem,
-    on_grid: Callable[[np.ndarray], Solution],
-    counts: tuple[int, int],
-    reference: Solution,
-    rate: int = 0,
-) -> float:
+    problem,
+    on_grid,
+    counts,
+    reference,
+    rate=0,
+):
     """Return log(error ratio) / log(ratio of the steps) at instants of both grids."""
     t = np.linspace(0.0, 0.5, 11)[1:]
     exact = reference.sample(t, rate)
@@ -180,13 +92,13 @@ def fitted_order(
     return float(np.log(errors[0] / errors[1]) / np.log(counts[1] / counts[0]))
 
 
-def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
+def profile(name):
     """Return a motion over half a second by a drive's profile, and where its phases end."""
     if name == "smooth":
         return swing, (0.0, 0.5)
     law, size = law_for(name, 1.0, Limits(), 0.4), np.array([0.1, 0.5, -0.4])
 
-    def motion(t: np.ndarray) -> RigidMotion:
+    def motion(t):
         s, sd, sdd = law(t, 0.5)
         return RigidMotion(HOMES[:3] + np.outer(s, size), np.outer(sd, size), np.outer(sdd, size))
 
@@ -202,9 +114,9 @@ def profile(name: str) -> tuple[Motion, tuple[float, ...]]:
         ("s-curve", 3, (40, 160)),
     ],
 )
-def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None:
+def test_order_of_radau(name, stages, counts):
     """2 s - 1 at the steps' ends; jumps of acceleration and jerk there, and only there, keep it."""
-    problem, _ = two_arms(*profile(name), axial=100.0, damping=2e-3)
+    problem = two_arms(*profile(name), axial=100.0, damping=2e-3)
     # One stage more on the finest steps: far below the errors that are measured, 1e-9 at the least.
     reference = radau.on_grid(problem, even_steps(problem, max(counts)), 1e-12, stages + 1)
     on_grid = lambda edges: radau.on_grid(problem, edges, 1e-12, stages)  # noqa: E731
@@ -214,9 +126,9 @@ def test_order_of_radau(name: str, stages: int, counts: tuple[int, int]) -> None
 
 
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
-def test_tolerance_is_met(damping: float) -> None:
+def test_tolerance_is_met(damping):
     """The true error is below it, and the estimate is near the true error."""
-    problem, _ = two_arms(damping=damping)
+    problem = two_arms(damping=damping)
     reference = radau.integrate(problem, 1e-10, 5, Profile())
     for stages, tolerance in ((2, 1e-2), (2, 1e-4), (4, 1e-2), (4, 1e-4), (4, 1e-8)):
         solution = solve(problem, tolerance, stages)
@@ -226,9 +138,9 @@ def test_tolerance_is_met(damping: float) -> None:
         assert 0.5 <= solution.error / true <= 1.6
 
 
-def test_relative_error_is_of_the_worst_arm() -> None:
+def test_relative_error_is_of_the_worst_arm():
     """sqrt(q'Kq), largest in time; an arm at rest is measured against a thousandth of the other."""
-    problem, _ = two_arms()
+    problem = two_arms()
     mechanism = problem.mechanism
     K = mechanism.bodies[0].K[0, 0]
     q, error = np.zeros((2, 3, 6))
@@ -242,39 +154,15 @@ def test_relative_error_is_of_the_worst_arm() -> None:
     assert nothing == pytest.approx(0.2 * np.sqrt(K), rel=1e-14)
 
 
-Answer = Callable[[int, Callable[[], Solution], np.ndarray], Solution]
-
-
-def test_large_deflections_are_solved_from_rest() -> None:
-    """Arms that bend by 0.45 rad, far from where Newton starts, against SciPy."""
-    problem, _ = two_arms(payload=2.0, bending=1.0, axial=30.0, damping=0.0)
-    found, t = solve(problem, 1e-5), np.linspace(0.0, 1.0, 101)
-    turn = np.kron(np.eye(2), problem.mechanism.bodies[0].outboard[2])
-    assert np.abs(found.q @ turn.T).max() > 0.4
-    q, qd = problem.initial_state()
-
-    def rate(now: float, y: np.ndarray) -> np.ndarray:
-        at, (a, b) = problem.at(np.array([now])), y.reshape(2, 1, 6)
-        mass = at.linearise(a, b, 0.0 * a).dense()[0, :, 12:]
-        return np.append(b, np.linalg.solve(mass, -at.residual(a, b, 0.0 * a)[0]))
-
-    y, right = np.append(q, qd), np.empty((101, 6))
-    for ends in pairwise(ENDS):
-        done = solve_ivp(rate, ends, y, "DOP853", rtol=1e-7, atol=1e-9, dense_output=True)
-        here, y = (t >= ends[0]) & (t <= ends[1]), done.y[:, -1]
-        right[here] = done.sol(t[here])[:6].T
-    assert relative_error(problem.mechanism, found.sample(t) - right, right) <= 1e-5
-
-
-def soft_arms() -> MachineSystem:
+def soft_arms():
     """Return arms spun up to where centrifugal forces beat the stiffness."""
     spun = lambda t: reach(t, (0.0, 300.0, 0.0))  # noqa: E731
-    return two_arms(spun, (0.0, 0.6), bending=1e-2, axial=1.0)[0]
+    return two_arms(spun, (0.0, 0.6), bending=1e-2, axial=1.0)
 
 
-def folded_arms() -> MachineSystem:
+def folded_arms():
     """Return arms that the first acceleration alone would fold."""
-    return two_arms(swing, (0.0, 1.0), payload=2.0, bending=1e-4, axial=1e-2)[0]
+    return two_arms(swing, (0.0, 1.0), payload=2.0, bending=1e-4, axial=1e-2)
 
 
 @pytest.mark.filterwarnings("error")
@@ -283,7 +171,7 @@ def folded_arms() -> MachineSystem:
     [
         (soft_arms, 1e-2, 3, r"deflects by \d+ %.*material\.young_modulus"),
         (folded_arms, 1e-2, 3, "no static equilibrium"),
-        (lambda: two_arms(swing, (0.0, 0.1))[0], 1e-17, 4, r"\S+e-1\d .*tolerance"),
+        (lambda: two_arms(swing, (0.0, 0.1)), 1e-17, 4, r"\S+e-1\d .*tolerance"),
     ],
     ids=["soft", "folded", "beyond rounding"],
 )
@@ -293,18 +181,18 @@ def test_what_cannot_be_solved_is_a_named_error(problem, tolerance, stages, word
     assert "\n" not in str(raised.value)
 
 
-def failing(*_: object) -> Iterate:
+def failing(*_):
     """Newton's method that never converges."""
     return Iterate(np.zeros((1, 3, 6)), False, 1)
 
 
-def test_march_finds_the_same_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_march_finds_the_same_motion(monkeypatch):
     """Where Newton's method fails over the horizon, and it is said so."""
-    problem, _ = two_arms()
+    problem = two_arms()
     plain, over_horizon = solve(problem, 1e-5), radau.newton_in_chunks
-    grids: list[int] = []
+    grids = []
 
-    def fails_at_first(stages: Stages, *others: Any) -> Iterate:
+    def fails_at_first(stages, *others):
         grids.append(len(stages.h))
         return failing() if len(grids) == 1 else over_horizon(stages, *others)
 
@@ -314,40 +202,40 @@ def test_march_finds_the_same_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     assert distance(problem, marched, plain) <= 1e-5 and len(grids) <= 4
 
 
-def test_newton_that_fails_everywhere_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_newton_that_fails_everywhere_is_a_named_error(monkeypatch):
     """Over the horizon and in windows of any length."""
     monkeypatch.setattr(radau, "newton_in_chunks", failing)
     monkeypatch.setattr(march, "newton", failing)
     with pytest.raises(ConvergenceError, match=r"no further than t = 0 s.*motion\.duration"):
-        solve(two_arms()[0], 1e-2)
+        solve(two_arms(), 1e-2)
 
 
 @pytest.mark.parametrize(
     ("error", "words"), [(2e-4, r"error of 0\.0002.*tolerance"), (9.0, "still changes")]
 )
-def test_error_that_no_steps_lower(monkeypatch, error: float, words: str) -> None:
+def test_error_that_no_steps_lower(monkeypatch, error, words):
     """Estimates that stay end after a few grids, in one line, not with the memory."""
-    grids: list[int] = []
+    grids = []
 
-    def constant(_: object, time_grid: np.ndarray, *others: object) -> Estimate:
+    def constant(_, time_grid, *others):
         grids.append(len(time_grid) - 1)
         return Estimate(error, np.full(len(time_grid) - 1, error), np.ones(2))
 
     monkeypatch.setattr(radau, "estimate", constant)
     with pytest.raises(ConvergenceError, match=words) as raised:
-        solve(two_arms()[0], 1e-4)
+        solve(two_arms(), 1e-4)
     assert "\n" not in str(raised.value)
     assert len(grids) <= measured.GRIDS_LIMIT and max(grids) <= measured.STEPS_LIMIT
 
 
 @pytest.mark.parametrize("share", [0.9, 1.1])
-def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, share: float) -> None:
+def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, share):
     """Where finer steps have no room, an error between the aim and the tolerance is accepted."""
     honest = radau.estimate
     monkeypatch.setattr(radau, "estimate", lambda *of: replace(honest(*of), error=share * 1e-4))
     monkeypatch.setattr(radau, "unresolved", lambda *_: (0.0, 0.0))
     monkeypatch.setattr(radau, "STEPS_LIMIT", 10)
-    problem, _ = two_arms()
+    problem = two_arms()
     if share < 1.0:
         assert solve(problem, 1e-4).error == share * 1e-4
     else:
@@ -355,31 +243,19 @@ def test_estimate_below_the_tolerance_is_no_refusal(monkeypatch, share: float) -
             solve(problem, 1e-4)
 
 
-def test_patience_that_ends_is_not_tried_again() -> None:
+def test_patience_that_ends_is_not_tried_again():
     """Work beyond what is counted ends a simulation: no finer grid, no march."""
     with counted(10.0), pytest.raises(ConvergenceError, match="more than 10 Newton iterations"):
-        solve(two_arms()[0], 1e-4)
+        solve(two_arms(), 1e-4)
 
 
-def arms_of_a_scene(*changes: str, cells: tuple[int, int] = (20, 2)) -> Any:
+def arms_of_a_scene(*changes, cells=(20, 2)):
     """Return the trajectory of two linear arms of half density, or the error."""
     built = build("simulation.stiffening=false", "motion.horizon=1.0", *changes, cells=cells)
     return built.evaluate(built.fields(lambda k, x, y: np.full_like(x, 0.5)), simulated=True)[1]
 
 
-def test_steps_follow_a_motion_with_a_short_event() -> None:
-    """A third of the length: for some milliseconds steps are 50 times shorter than elsewhere."""
-    # Even steps over 3 s, 100 x 6 cells, were 10 969.
-    trajectory = arms_of_a_scene("motion.duration=0.7")
-    steps = np.diff(trajectory.solution.time_grid)
-    assert len(steps) < 600
-    assert steps.max() > 20.0 * steps.min()
-    assert trajectory.deflections.max() == pytest.approx(0.330, abs=1e-3)
-    fine = radau.integrate(trajectory.problem, 1e-5, 5, Profile(), trajectory.solution)
-    assert distance(trajectory.problem, trajectory.solution, fine) < 1e-4
-
-
-def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_deflections_beyond_the_model_are_refused(monkeypatch):
     """Half of an arm's length, by the march, and by what Newton's method finds at once."""
     remedy = r"deflects by [0-9.]+ % .*50 %.*young_modulus"
     with pytest.raises(ConvergenceError, match="t = .* an arm " + remedy):
@@ -389,15 +265,15 @@ def test_deflections_beyond_the_model_are_refused(monkeypatch: pytest.MonkeyPatc
         arms_of_a_scene("motion.duration=1.0", "payload.mass=1")
 
 
-def test_nothing_moves_without_loads() -> None:
+def test_nothing_moves_without_loads():
     """Zero, not a division by it."""
-    problem, _ = two_arms(still, (0.0, 1.0))
+    problem = two_arms(still, (0.0, 1.0))
     solution = solve(problem, 1e-4)
     assert solution.error == 0.0
     assert not solution.sample(np.linspace(0.0, 1.0, 11)).any()
 
 
-def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
+def fine_beam(bending, axial, damping=1e-3):
     """Return a cantilever of many coordinates, frequencies from 1.4 Hz to their squares."""
     # v_k = 1 - cos(p_k u), w_k = sin(p_k u), p_k = (k - 1/2) pi, u = x / length: the second and
     # first derivatives are orthogonal, the stiffness is diagonal in closed form.
@@ -415,32 +291,25 @@ def fine_beam(bending: int, axial: int, damping: float = 1e-3) -> Cloud:
     return Cloud(points, np.full(count, 0.6 / count), modes, K, damping * K, outboard, ends)
 
 
-def fine_arms(bending: int = 6, axial: int = 2, damping: float = 1e-3) -> MachineSystem:
+def fine_arms(bending=6, axial=2, damping=1e-3):
     """Return two such arms with a payload, in motion under gravity."""
-    arm = fine_beam(bending, axial, damping)
-    chain = Chain((arm, arm), 1.0, 0.0, (0.0, -9.81), 0.0)
-    return MachineSystem(chain.mechanism(), reach, ENDS)
+    arm = fine_beam(bending, axial, damping).body()
+    return MachineSystem(plane_chain([arm] * 2, 1.0, 0.0, (0.0, -9.81), 0.0), reach, ENDS)
 
 
-def some_stages(problem: MachineSystem) -> Stages:
-    """Return the stages of five steps of two lengths, in modal coordinates."""
-    edges = np.concatenate([[0.0], 0.02 * np.cumsum(1.0 + np.arange(5) % 2)])
-    return stages_of(modes_of(problem), radau.radau_iia(3), edges)
-
-
-def slow_up_to(monkeypatch: pytest.MonkeyPatch, *limits: float) -> None:
+def slow_up_to(monkeypatch, *limits):
     """Treat coordinates densely up to these angles, tried in turn, then all."""
     monkeypatch.setattr(newton_matrix, "SLOW_ANGLES", limits)
     monkeypatch.setattr(newton_matrix, "DENSE_COORDINATES", 0)
 
 
 @pytest.fixture
-def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+def matrices(monkeypatch):
     """Return steps and slow coordinates of every matrix that the test will make."""
-    made: list[tuple[int, int]] = []
+    made = []
 
-    def spied(function: Callable[..., NewtonMatrix]) -> Callable[..., NewtonMatrix]:
-        def spy(stages: Stages, *others: Any) -> NewtonMatrix:
+    def spied(function):
+        def spy(stages, *others):
             slow = [x for x in others if isinstance(x, np.ndarray)][-1]
             made.append((len(stages.h), len(slow)))
             return function(stages, *others)
@@ -452,47 +321,8 @@ def matrices(monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
     return made
 
 
-def test_modes_are_a_change_of_coordinates() -> None:
-    """Rows in z are T' the rows in q at the same motion; every arm's stiffness is the identity."""
-    rng = np.random.default_rng(3)
-    clouds = tuple(random_cloud(rng, size) for size in (3, 5))
-    chain = Chain(clouds, 1.0, 0.1, (0.5, -9.81), 0.0)
-    problem = MachineSystem(chain.mechanism(), swing, (0.0, 1.0))
-    modes = modes_of(problem)
-    assert_close(modes.system.mechanism.stiffness(), np.eye(8), 1e-12)
-    assert (np.diff(modes.frequencies[:3]) < 0.0).all()
-    motion = problem.motion(rng.uniform(size=4))
-    z = rng.normal(size=(3, 4, 8))
-    q = [modes.from_modes(x) for x in z]
-    assert_close(modes.to_modes(np.array(q)), z, 1e-12)
-    rows = inverse_dynamics(problem.mechanism, motion, *q)[0]
-    found = inverse_dynamics(modes.system.mechanism, motion, *z)[0]
-    assert_close(found, modes.gradient_to_modes(rows), 1e-12)
-    assert_close(modes.gradient_from_modes(found), rows, 1e-12)
-
-
-def test_matrix_of_slow_coordinates_is_the_derivative() -> None:
-    """A step takes the rows' linear part away, and reports the change of q it makes."""
-    problem, _ = two_arms()
-    stages = some_stages(problem)
-    rng = np.random.default_rng(4)
-    state = (rng.normal(scale=0.05, size=(1, 6)), rng.normal(scale=0.5, size=(1, 6)))
-    a = rng.normal(size=(5, 3, 6))
-    at = at_stages(stages, state, a)
-    step, shift = factorise(stages, *at, a, np.arange(6)).solve(
-        residual_at(stages, *at, a), np.zeros((2, 6))
-    )
-
-    def rows(t: float) -> np.ndarray:
-        moved = a + t * step
-        return residual_at(stages, *at_stages(stages, state, moved), moved)
-
-    assert_close(derivative(rows), -rows(0.0), 1e-9)  # of differences
-    assert_close(at_stages(stages, state, a + step)[0], at[0] + shift, 1e-12)
-
-
 @pytest.mark.parametrize(("damping", "tolerance"), [(0.0, 1e-2), (1e-3, 1e-4), (1.0, 1e-6)])
-def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance) -> None:
+def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance):
     """The same motion and estimate as with the exact matrix."""
     problem = fine_arms(5, 1, damping)
     edges = even_steps(problem, 60)
@@ -506,17 +336,17 @@ def test_fast_coordinates_change_nothing(monkeypatch, damping, tolerance) -> Non
 
 
 @pytest.mark.parametrize("bending", [10.0, 1000.0])
-def test_estimate_of_vibrations_that_are_not_resolved(bending: float) -> None:
+def test_estimate_of_vibrations_that_are_not_resolved(bending):
     """Undamped arms, steps from a fifth of the slowest period to five of them."""
     # Estimates of 0.6 to 2.6 times the error were seen, without `unresolved` down to 0.34.
-    problem, _ = two_arms(payload=0.0, bending=bending, damping=0.0)
+    problem = two_arms(payload=0.0, bending=bending, damping=0.0)
     fine = radau.on_grid(problem, even_steps(problem, 800), 1e-7, 5)
     for steps, stages in product((8, 20), (3, 4)):
         found = radau.on_grid(problem, even_steps(problem, steps), 1e-6, stages)
         assert 0.6 <= found.error / distance(problem, found, fine) <= 3.0
 
 
-def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]]) -> None:
+def test_cost_hardly_grows_with_the_coordinates(matrices):
     """Blocks of a few slow coordinates of 8, 24, 96; about as many iterations."""
     iterations, slow = [], []
     for bending, axial in ((3, 1), (9, 3), (36, 12)):
@@ -529,7 +359,7 @@ def test_cost_hardly_grows_with_the_coordinates(matrices: list[tuple[int, int]])
     assert max(iterations) <= 24  # on two grids; 18 to 20, by which coordinates are just fast
 
 
-def test_poor_contraction_makes_the_matrix_denser(monkeypatch, matrices) -> None:
+def test_poor_contraction_makes_the_matrix_denser(monkeypatch, matrices):
     """With one slow coordinate where eight are: widened, and solved all the same."""
     problem = fine_arms()
     plain = radau.integrate(problem, 1e-6, 3, Profile())
@@ -541,7 +371,7 @@ def test_poor_contraction_makes_the_matrix_denser(monkeypatch, matrices) -> None
     assert forced.error == pytest.approx(plain.error, rel=0.3)  # other steps
 
 
-def test_dense_matrices_are_kept_small(monkeypatch, matrices) -> None:
+def test_dense_matrices_are_kept_small(monkeypatch, matrices):
     """Steps whose blocks take too much memory are solved a few at a time, forth and back."""
     problem = fine_arms(5, 1)
     edges = even_steps(problem, 60)
@@ -563,12 +393,12 @@ def test_dense_matrices_are_kept_small(monkeypatch, matrices) -> None:
         assert_close(a.W, b.W, 1e-9)
 
 
-def integrals(one: ShapeIntegrals) -> list[np.ndarray]:
+def integrals(one):
     return [one.w[:, 1:], one.M, one.W[1, 1:, 1:], one.K, one.outboard]
 
 
 @pytest.mark.parametrize("limit", [20.0, 1e-3])
-def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limit: float) -> None:
+def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limit):
     """Corrected until it is; of an undamped chain too, and where the matrix must be widened."""
     problem = fine_arms(damping=0.0)
     solution = radau.on_grid(problem, even_steps(problem, 60), 1e-8, 3)
@@ -585,39 +415,10 @@ def test_adjoint_is_exact_with_fast_coordinates(monkeypatch, matrices, limit: fl
             assert_close(own, other, 1e-8)  # multipliers are corrected to it, largest component
 
 
-def waves(number: int) -> Motion:
-    """Return motions of so many waves within 2 s, from rest to rest."""
-    ends = np.polynomial.Polynomial([0.0, 0.0, 0.0, 8.0, -12.0, 6.0, -1.0])  # (t (2 - t))^3
-
-    def motion(t: np.ndarray) -> RigidMotion:
-        w = np.pi * number
-        sine = [np.sin(w * t), w * np.cos(w * t), -w * w * np.sin(w * t)]
-        window = [ends.deriv(k)(t) if k else ends(t) for k in range(3)]
-        first = window[1] * sine[0] + window[0] * sine[1]
-        second = window[2] * sine[0] + 2.0 * window[1] * sine[1] + window[0] * sine[2]
-        size = np.array([0.05, 0.6, -0.4])  # m, rad
-        return RigidMotion(*(np.outer(x, size) for x in (window[0] * sine[0], first, second)))
-
-    return motion
-
-
-@pytest.mark.parametrize(("number", "damping"), [(2, 0.0), (16, 2e-4)])
-def test_steps_of_stiff_arms_follow_the_motion(number: int, damping: float) -> None:
-    """Far fewer than eight steps a period, where vibrations are below the tolerance."""
-    stiff = {"bending": 4e5, "axial": 1.2e7, "damping": damping}
-    problem, _ = two_arms(waves(number), (0.0, 2.0), **stiff)
-    usual = int(8.0 * 2.0 * problem.slowest_frequency() / (2.0 * np.pi))  # eight a period
-    fine = radau.on_grid(problem, even_steps(problem, usual), 1e-8, 5)
-    for tolerance, most in ((1e-3, usual / 10), (1e-4, usual / 2), (1e-6, np.inf)):
-        found = radau.integrate(problem, tolerance, 4, Profile())
-        assert distance(problem, found, fine) <= tolerance
-        assert len(found.a) <= most
-
-
-def test_warm_start_saves_iterations() -> None:
+def test_warm_start_saves_iterations():
     """From a design one percent stiffer, and from the solution itself."""
-    near, _ = two_arms(bending=10.1, axial=303.0)
-    problem, _ = two_arms()
+    near = two_arms(bending=10.1, axial=303.0)
+    problem = two_arms()
     start = radau.integrate(near, 1e-5, 3, Profile())
     profiles = [Profile() for _ in range(3)]
     cold = radau.integrate(problem, 1e-5, 3, profiles[0])
@@ -631,31 +432,13 @@ def test_warm_start_saves_iterations() -> None:
     assert np.array_equal(again.time_grid, warm.time_grid)
 
 
-def test_start_of_other_stages_or_size_is_used_or_ignored() -> None:
+def test_start_of_other_stages_or_size_is_used_or_ignored():
     """Another number of stages gives a first guess, another number of coordinates none."""
-    problem, _ = two_arms()
+    problem = two_arms()
     cold = radau.integrate(problem, 1e-5, 3, Profile())
     warm = radau.integrate(problem, 1e-5, 4, Profile(), cold)
     assert distance(problem, warm, cold) <= 2e-5
-    single, _ = two_arms(lambda t: reach(t, (0.2, 1.0)), arms=1)
+    single = two_arms(lambda t: reach(t, (0.2, 1.0)), arms=1)
     start = radau.integrate(single, 1e-5, 3, Profile())
     other = radau.integrate(problem, 1e-5, 3, Profile(), start)
     assert distance(problem, other, cold) <= 2e-5
-
-
-def test_sample_of_known_polynomials() -> None:
-    """Cubic motion from linear accelerations over uneven steps, both ends included."""
-    edges = np.array([0.0, 0.3, 1.0])
-    nodes = np.array([0.2, 1.0])
-    coefficients = np.array([[1.0, -2.0, 3.0, 0.5], [0.3, 0.7, -1.1, 2.0]])  # of t^0 .. t^3
-    motion = [np.polynomial.Polynomial(c) for c in coefficients]
-
-    def values(t: np.ndarray, order: int) -> np.ndarray:
-        return np.stack([p.deriv(order)(t) if order else p(t) for p in motion], axis=-1)
-
-    stages = edges[:-1, None] + np.diff(edges)[:, None] * nodes
-    begin = values(edges[:-1], 0), values(edges[:-1], 1)
-    solution = Solution(edges, nodes, *begin, values(stages, 2), 0.0, 0)
-    t = np.array([0.0, 0.1, 0.3, 0.31, 0.9, 1.0])
-    for order in range(3):
-        assert_close(solution.sample(t, order), values(t, order), 1e-14)

@@ -3,10 +3,7 @@
 `reference/README.md` says what the tables are.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,7 +34,6 @@ import dolfinopt as do
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import desired_motion, largest_stiffness_change
 from dolfinopt.dynamics.known_forces import feed_forward
-from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.exchange.in_space import in_space
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.multibody.shape_integrals import rigid_spatial_body
@@ -49,7 +45,7 @@ CONTROL = {"stiffness": [1e6, 1e8], "damping": [1e4, 1e5]}
 SPRING = boom()["closures"][0] | {"stiffness": 1e7, "damping": 1e4}
 
 
-def compliant_boom() -> Any:
+def compliant_boom():
     """Return the boom with a bearing and a gear that give way, and friction."""
     tree = boom()
     slew, luff = tree["joints"]
@@ -59,9 +55,7 @@ def compliant_boom() -> Any:
     return tree
 
 
-def free_motion(
-    system: MachineSystem, steps: int, t: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float]:
+def free_motion(system, steps, t):
     """Return rigid coordinates and rates of rigid arms at t, and the largest gap at steps' ends."""
     grid = np.linspace(0.0, system.breakpoints[-1], steps + 1)
     solution = radau.on_grid(system, grid, 1e-8, 4)
@@ -75,7 +69,7 @@ def free_motion(
 
 
 @pytest.mark.serial
-def test_double_four_bar(tmp_path) -> None:
+def test_double_four_bar(tmp_path):
     """All bars turn as one pendulum does, through positions where the linkage is singular."""
     # Of Exudyn's table positions are off by its steps, 5e-7 m; here 500 steps leave 1e-7.
     tree, bodies = double_four_bar()
@@ -89,7 +83,7 @@ def test_double_four_bar(tmp_path) -> None:
     assert gap < 1e-12  # m; measured 4e-14
     # 3 m L2 / 3 + 2 m L2 of inertia, and gravity on 3 m L / 2 + 2 m L: 3.5 / 3 of g / L.
 
-    def pendulum(_: float, z: np.ndarray) -> list[float]:
+    def pendulum(_, z):
         return [z[1], -3.5 / 3.0 * GRAVITY * np.cos(z[0])]
 
     start = [0.5 * np.pi, -1.0]
@@ -105,7 +99,7 @@ def test_double_four_bar(tmp_path) -> None:
 
 
 @pytest.mark.serial
-def test_spatial_slider_crank(tmp_path) -> None:
+def test_spatial_slider_crank(tmp_path):
     """Ball, universal joint and slider: positions as Exudyn has them to its own error."""
     tree, bodies = spatial_slider_crank()
     system = started(free(tmp_path, tree, "t,turn\n0,0\n1,0.5\n", bodies), 6.0)
@@ -119,7 +113,7 @@ def test_spatial_slider_crank(tmp_path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.serial
-def test_flexible_slider_crank(tmp_path) -> None:
+def test_flexible_slider_crank(tmp_path):
     """Out of the plane, too: the rod is beside the crank, and bends and twists it."""
     expected = reference("flexible_slider_crank_in_space")
     trajectory, system = machine(do.Model(flexible_slider_crank(tmp_path)).simulate())
@@ -148,7 +142,7 @@ def test_flexible_slider_crank(tmp_path) -> None:
     ],
     ids=["stiffened", "spring", "compliant", "five-bar"],
 )  # fmt: skip
-def test_energy_and_gaps(tmp_path, tree: dict, table: str, changes: dict[str, Any]) -> None:
+def test_energy_and_gaps(tmp_path, tree, table, changes):
     result = do.Model(closed(tmp_path, table, tree, **changes)).simulate()
     assert imbalance(result) < 1e-8  # measured 3e-10 at most, with a tolerance of 1e-4
     # Pins give way out of the plane by 1e-6 of the softest arm; measured 2e-10, 3e-12 of others.
@@ -156,7 +150,7 @@ def test_energy_and_gaps(tmp_path, tree: dict, table: str, changes: dict[str, An
 
 
 @pytest.mark.serial
-def test_forces_of_a_cylinder(tmp_path) -> None:
+def test_forces_of_a_cylinder(tmp_path):
     """At rest by the lever of boom and load; the drive's force is that of the closure."""
     scene = closed(tmp_path, BOOM_TABLE, boom(), control=CONTROL)
     trajectory, system = machine(do.Model(scene).simulate())
@@ -180,7 +174,7 @@ def test_forces_of_a_cylinder(tmp_path) -> None:
 
 
 @pytest.mark.serial
-def test_a_spring_gives_way(tmp_path) -> None:
+def test_a_spring_gives_way(tmp_path):
     """Of a cylinder with stiffness the oil's column is shorter by force over stiffness."""
     spring = SPRING | {"damping": 0.0}
     fine = {"tolerance": 1e-6}  # of positions: multipliers are of lower order
@@ -191,7 +185,7 @@ def test_a_spring_gives_way(tmp_path) -> None:
 
 
 @pytest.mark.skipif(WORLD.size == 1, reason="needs more than one rank")
-def test_same_design_on_any_number_of_ranks(shared_tmp_path) -> None:
+def test_same_design_on_any_number_of_ranks(shared_tmp_path):
     scene = closed(shared_tmp_path, BOOM_TABLE, boom())
     together = do.optimize(scene)
     alone = on_root(WORLD, lambda: do.optimize(scene, world=MPI.COMM_SELF).x_phys)
@@ -200,7 +194,7 @@ def test_same_design_on_any_number_of_ranks(shared_tmp_path) -> None:
 
 
 @pytest.mark.serial
-def test_stiffening_sees_the_forces_of_closures(tmp_path) -> None:
+def test_stiffening_sees_the_forces_of_closures(tmp_path):
     """A weightless bar between a drive and a mass that only a pin holds to it: F / buckling load.
 
     That of a clamped column whose deflection is cubic, 4/3 (13 - 2 sqrt 31) E I / l^2 = 2.486

@@ -1,15 +1,9 @@
 """Machines of rigid arms alone: every command but those that design."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
-from machines import Tree, loop_tree, with_keys
+from machines import with_keys
 from runs import refusal, run, summary_of
-from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicSpline
 
 import dolfinopt as do
 from dolfinopt.part.folder import toml_text
@@ -20,7 +14,7 @@ MASS, INERTIA, LENGTH, LOAD, EARTH = 2.0, 0.3, 1.0, 1.5, 9.81  # kg, kg m2, m, k
 CONTROL = {"stiffness": [2e3], "damping": [20.0]}
 
 
-def pendulum(folder: Path, **tables) -> Tree:
+def pendulum(folder, **tables):
     """Return one rigid arm with a payload on a table of its angle."""
     (folder / "swing.csv").write_text("t,arm\n0,-1.0\n0.6,0.8\n")
     tree = {
@@ -36,7 +30,7 @@ def pendulum(folder: Path, **tables) -> Tree:
 
 
 @pytest.mark.parametrize("control", [None, CONTROL])
-def test_torque_of_a_pendulum(control, tmp_path) -> None:
+def test_torque_of_a_pendulum(control, tmp_path):
     """(J + m L^2 / 4 + M L^2) qdd + (m / 2 + M) g L cos q; under control the same, and no error."""
     result = do.Model(pendulum(tmp_path, control=control)).simulate()
     seen = result.trajectory.sampled
@@ -47,39 +41,7 @@ def test_torque_of_a_pendulum(control, tmp_path) -> None:
     assert np.abs(seen.motion.qdd).max() > 1.0 and result.max_deviation < 1e-12
 
 
-def test_slider_crank_without_feed_forward() -> None:
-    """(J + m x'^2) phi'' + m x' x'' phi'^2 = K (phi_d - phi) + D (phi_d' - phi'), by SciPy."""
-    J, m, r, rod, K, D = 0.01, 0.5, 0.15, 0.3, 2e3, 20.0
-    tree = loop_tree(
-        control={"stiffness": [K], "damping": [D], "feed_forward": "none"}, payload={"mass": m}
-    )
-    bars = ({"inertia": J}, {"rigid": True, "mass": 0.0, "inertia": 0.0})
-    tree["arms"] = [arm | keys for arm, keys in zip(tree["arms"], bars, strict=True)]
-    tree["simulation"]["tolerance"] = 1e-6
-    trajectory = do.Model(scene_from_dict(tree)).simulate().trajectory
-    assert trajectory is not None
-
-    t = np.linspace(0.0, trajectory.t[-1], 4001)
-    motion = trajectory.problem.motion(t)
-    desired = CubicSpline(t, np.stack([motion.q[:, 1], motion.qd[:, 1]], axis=1))
-
-    def rates(t: float, state: np.ndarray) -> list[float]:
-        angle, speed = state
-        place, rate = desired(t)
-        s, c = np.sin(angle), np.cos(angle)
-        root = np.sqrt(rod * rod - r * r * s * s)
-        by_angle = -r * s - r * r * s * c / root  # x', of x = r c + root
-        curvature = -r * c - r * r * (c * c - s * s) / root - r**4 * (s * c) ** 2 / root**3
-        force = K * (place - angle) + D * (rate - speed)
-        return [speed, (force - m * by_angle * curvature * speed**2) / (J + m * by_angle**2)]
-
-    t, begin = trajectory.t, trajectory.desired.q[0, 1]
-    exact = solve_ivp(rates, (0.0, t[-1]), [begin, 0.0], "DOP853", t, rtol=1e-8, atol=1e-10)
-    error = trajectory.q_r[:, 1] - exact.y[0]
-    assert np.abs(error).max() < 1e-5 * np.abs(exact.y[0] - trajectory.desired.q[:, 1]).max()
-
-
-def test_commands(tmp_path, capsys) -> None:
+def test_commands(tmp_path, capsys):
     """Simulated, drawn anew, swept, exported; to optimise there is nothing."""
     scene, out = tmp_path / "scene.toml", tmp_path / "run"
     scene.write_text(toml_text(pendulum(tmp_path)))
@@ -100,6 +62,6 @@ def test_commands(tmp_path, capsys) -> None:
 
 
 @pytest.mark.parametrize("kind", ["eigenfrequency", "stress", "static"])
-def test_responses_of_flexible_arms(kind: str, tmp_path) -> None:
+def test_responses_of_flexible_arms(kind, tmp_path):
     tree = pendulum(tmp_path, objective={"kind": kind})
     refusal(lambda: scene_from_dict(tree), "objective.kind", "no arm is flexible")

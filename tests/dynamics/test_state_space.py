@@ -1,79 +1,24 @@
 """Machines linearised: closed forms, differences of the nonlinear equations, loops, files."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
-from machines import controlled, loop_tree, trajectory_of, two_arm, with_keys
+from machines import controlled, loop_tree, trajectory_of, two_arm
 from runs import ROOT, refusal
 
 import dolfinopt as do
-from dolfinopt.dynamics.build import Trajectory, free_machine, state_space
-from dolfinopt.dynamics.linearised import Linearised
+from dolfinopt.dynamics.build import free_machine, state_space
 from dolfinopt.dynamics.poles import poles_of
-from dolfinopt.dynamics.state_space import StateSpace
 from dolfinopt.responses.linearised_machine import accurate_below
-from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial
-MODULUS, DENSITY, LENGTH, HEIGHT, THICKNESS = 70e9, 2700.0, 1.0, 0.02, 0.01
 
 
-def hanging(folder: Path, gravity: float = 9.81, **tables) -> Trajectory:
-    """Return a slender beam of solid material that hangs at rest from its joint."""
-    rows = f"t,arm\n0,{-0.5 * np.pi}\n0.1,{-0.5 * np.pi}\n"
-    (folder / "held.csv").write_text(rows)
-    tree = {
-        "material": {"young_modulus": MODULUS, "poisson_ratio": 0.0, "density": DENSITY},
-        "arms": [{"name": "arm", "length": LENGTH, "height": HEIGHT, "thickness": THICKNESS,
-                  "cells": [60, 3]}],
-        "motion": {"path": "joints", "file": "held.csv", "base": "fixed", "duration": 0.1,
-                   "horizon": 0.1, "gravity": [0.0, -gravity]},
-        "payload": {"mass": 0.0},
-        "damping": {"stiffness_proportional": 0.0},
-        "reduction": {"coordinates": 10},
-        "design": {"initial": 1.0, "volume_fraction": 1.0},
-    }  # fmt: skip
-    return trajectory_of(scene_from_dict(with_keys(tree, tables), str(folder / "held.toml")))
-
-
-def test_free_drive_leaves_a_pendulum(tmp_path) -> None:
-    """Its frequency sqrt(m g c / J), and the static compliance of joint and tip."""
-    found = state_space(hanging(tmp_path), 0.05)
-    mass = DENSITY * LENGTH * HEIGHT * THICKNESS
-    J = mass * (LENGTH**2 / 3.0 + HEIGHT**2 / 12.0)
-    exact = np.sqrt(0.5 * mass * 9.81 * LENGTH / J)
-    assert abs(found.poles[0]) == pytest.approx(exact, rel=1e-4)  # the beam bends by 1e-4
-    assert np.abs(found.poles.real).max() < 1e-6
-    assert found.states[:2] == ("arm", "arm q1") and len(found.states) == 22
-    assert found.inputs == ("arm", "tool fx", "tool fy", "tool mz")
-    gain = -found.C @ np.linalg.solve(found.A, found.B)
-    # A moment M turns it by M / (m g c); a force F at the tip, across, by F L / (m g c).
-    stiffness = 0.5 * mass * 9.81 * LENGTH
-    assert gain[0, :2] == pytest.approx([1.0 / stiffness, LENGTH / stiffness], rel=2e-3)
-    # Gravity bends it back along its length by twice the force: (1/3 - 2/8) F L^3 / E I.
-    bent = LENGTH**3 / (12.0 * MODULUS * THICKNESS * HEIGHT**3 / 12.0)
-    across = found.outputs.index("deflection x")
-    assert gain[across, 1] == pytest.approx(bent, rel=3e-3)
-
-
-def test_stiff_drive_clamps_the_beam(tmp_path) -> None:
-    """Euler and Bernoulli's frequencies of a cantilever, 0.1 to 0.4 % above Timoshenko's."""
-    gains = {"stiffness": [1e9], "damping": [0.0]}
-    found = state_space(hanging(tmp_path, 0.0, control=gains), 0.0)
-    exact = np.array([1.875104, 4.694091, 7.854757]) ** 2 / (2.0 * np.pi)
-    exact *= np.sqrt(MODULUS * HEIGHT**2 / (12.0 * DENSITY)) / LENGTH**2
-    assert found.closed
-    assert found.arrays()["frequencies"][:6:2] == pytest.approx(exact, rel=5e-3)
-
-
-def machine_at(trajectory: Trajectory, t: float) -> Linearised:
+def machine_at(trajectory, t):
     return free_machine(trajectory, t)
 
 
-def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
+def accelerations(one, x):
     """Return z'' (n,) for independent coordinates and rates x (2 n,), by the equations alone."""
     system, instants = one.system, one.system.at(one.t)
     _, moving, last = system.ends
@@ -84,7 +29,7 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
     n = len(independent)
     y[0, independent], yd[0, independent] = x[:n], x[n:]
 
-    def jacobian(y: np.ndarray, yd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def jacobian(y, yd):
         state = instants.state(y, yd, rest)
         here, speeds = state.closed, np.hstack([state.motion.qd, state.elastic[1]])[0]
         bias = [
@@ -117,17 +62,17 @@ def accelerations(one: Linearised, x: np.ndarray) -> np.ndarray:
     return np.linalg.solve(matrix, -r)[independent]
 
 
-def open_two_arm() -> Trajectory:
+def open_two_arm():
     return trajectory_of(scene_from_dict(two_arm("arms.cells=[16,2]", "motion.gravity=[0,-9.81]")))
 
 
-def soft_two_arm() -> Trajectory:
+def soft_two_arm():
     soft = {"joint_stiffness": 3e4, "joint_damping": 30.0, "rotor_inertia": 2e-5}
     changes = [f"arms.{key}={value}" for key, value in (*soft.items(), ("gear_ratio", 100.0))]
     return trajectory_of(controlled(*changes, "simulation.stiffening=true"))
 
 
-def geared_two_arm() -> Trajectory:
+def geared_two_arm():
     """Return arms on gears and bearings, with friction, whose drives nothing controls."""
     keys = {"gear_stiffness": 3e4, "gear_damping": 30.0, "rotor_inertia": 2e-5, "gear_ratio": 100.0,
             "bearing_stiffness": [1e7, 1e7, 0, 0, 0, 0], "friction": [5.0, 2.0]}  # fmt: skip
@@ -136,7 +81,7 @@ def geared_two_arm() -> Trajectory:
     return trajectory_of(scene_from_dict(two_arm("arms.cells=[16,2]", *changes)))
 
 
-def slider(**tables) -> Trajectory:
+def slider(**tables):
     return trajectory_of(scene_from_dict(loop_tree(**tables, simulation={"tolerance": 1e-6})))
 
 
@@ -156,7 +101,7 @@ MACHINES = {
 
 
 @pytest.mark.parametrize("kind", MACHINES)
-def test_matrix_is_the_derivative_of_the_nonlinear_equations(kind: str) -> None:
+def test_matrix_is_the_derivative_of_the_nonlinear_equations(kind):
     """By central differences of accelerations that are solved for, loops closed anew each time."""
     make, t = MACHINES[kind]
     trajectory = make()
@@ -180,17 +125,17 @@ def test_matrix_is_the_derivative_of_the_nonlinear_equations(kind: str) -> None:
     assert (np.abs(exact - differences).max(axis=0) / size).max() < 3e-5
 
 
-def test_inputs_and_outputs_answer_each_other() -> None:
+def test_inputs_and_outputs_answer_each_other():
     """Places move by what forces there do: the gains of tool and drives are symmetric."""
     # Without control and motion the machine is conservative.
-    found: StateSpace = state_space(open_two_arm(), 0.0)
+    found = state_space(open_two_arm(), 0.0)
     s = 3.0
     gain = found.C @ np.linalg.solve(s * np.eye(len(found.A)) - found.A, found.B)
     block = gain[:5, :5]  # cart, two joints, tool x and y by the forces there
     assert np.abs(block - block.T).max() < 1e-3 * np.abs(block).max()
 
 
-def test_least_damping_follows_the_control() -> None:
+def test_least_damping_follows_the_control():
     """More derivative gain, more damping; the limit is met or not, and told so."""
     ratios = []
     for factor in (0.5, 1.0):
@@ -216,66 +161,19 @@ def test_least_damping_follows_the_control() -> None:
 # -- closed loops of rigid arms, linearised by hand ------------------------------------------------
 
 
-def of_second_order(M: np.ndarray, D: np.ndarray, K: np.ndarray) -> np.ndarray:
+def of_second_order(M, D, K):
     """Return the poles (2 n,) of M z'' + D z' + K z = 0, sorted."""
     n = len(M)
     A = np.block([[np.zeros((n, n)), np.eye(n)], [-np.linalg.solve(M, K), -np.linalg.solve(M, D)]])
     return np.sort_complex(np.linalg.eigvals(A))
 
 
-def bar(name: str, length: float) -> dict:
+def bar(name, length):
     """Return a rigid arm in space that weighs nothing."""
     return {"name": name, "rigid": True, "length": length, "mass": 0.0, "inertia": [0.0] * 6}
 
 
-def parallelogram(folder: Path, **tables) -> Scene:
-    """Return four bars on two motors about one axis that carry a payload, controlled.
-
-    Its closure is a pin about z: two of its five equations keep the bars together, those across
-    the plane are redundant.
-    """
-    (folder / "turn.csv").write_text("t,first,second\n0,2.0,0.6\n0.3,1.2,1.0\n")
-    chain = (("first", "ground", "a"), ("elbow", "a", "ab"),
-             ("second", "ground", "b"), ("wrist", "b", "ba"))  # fmt: skip
-    joints = [
-        {"name": name, "type": "revolute", "parent": parent, "child": child, "axis": [0, 0, 1],
-         "passive": name in ("elbow", "wrist")}
-        for name, parent, child in chain
-    ]  # fmt: skip
-    tree = {
-        "material": {"young_modulus": MODULUS, "poisson_ratio": 0.3, "density": DENSITY},
-        "arms": [bar("a", 0.3), bar("ab", 0.4), bar("b", 0.4), bar("ba", 0.3)],
-        "joints": joints,
-        "closures": [{"name": "pin", "kind": "pin", "between": ["ba", "ab"], "axis": [0, 0, 1]}],
-        "motion": {"path": "joints", "file": "turn.csv", "horizon": 0.4, "gravity": [0, 0, -9.81],
-                   "initial_joints": [2.0, -1.4, 0.6, 1.4]},
-        "payload": {"arm": "ab", "mass": 0.5},
-        "control": {"stiffness": [500.0, 400.0], "damping": [5.0, 4.0]},
-    }  # fmt: skip
-    return scene_from_dict(with_keys(tree, tables), str(folder / "parallelogram.toml"))
-
-
-def test_poles_of_a_loop_in_space(tmp_path) -> None:
-    """Two coordinates, in motion: T = m |a e(alpha) + b e(beta)|'^2 / 2; the response is theirs."""
-    limits = {"damping_ratio": 0.1, "poles_at": [0.0, 0.1, 0.2]}
-    result = do.Model(parallelogram(tmp_path, constraints=limits)).simulate()
-    trajectory, ratios = result.trajectory, []
-    m, a, b = 0.5, 0.3, 0.4
-    for t in limits["poles_at"]:
-        motion = trajectory.at(np.array([t])).motion
-        (q, second), (w, v), (wd, vd) = (x[0, [0, 2]] for x in (motion.q, motion.qd, motion.qdd))
-        c, s = np.cos(q - second), np.sin(q - second)
-        M = m * np.array([[a * a, a * b * c], [a * b * c, b * b]])
-        D = np.diag([5.0, 4.0]) + 2.0 * m * a * b * s * np.array([[0.0, v], [-w, 0.0]])
-        turned = m * a * b * np.array([[c * v * v - s * vd], [-c * w * w - s * wd]])
-        exact = of_second_order(M, D, np.diag([500.0, 400.0]) + turned * [1.0, -1.0])
-        found = np.sort_complex(state_space(trajectory, t).poles)
-        assert np.abs(found - exact).max() < 1e-8 * np.abs(exact).max()
-        ratios.append((-exact.real / np.abs(exact)).min())
-    assert result.evaluation.values_of("damping_ratio")[0] == pytest.approx(min(ratios), rel=1e-8)
-
-
-def test_poles_of_a_loop_in_the_plane() -> None:
+def test_poles_of_a_loop_in_the_plane():
     """A slider-crank in motion: (J + m x'^2) of its angle, with the slider's place x."""
     J, m, r, rod = 0.01, 0.5, 0.15, 0.3
     tree = loop_tree(control={"stiffness": [2e3], "damping": [20.0]}, payload={"mass": m})
@@ -287,7 +185,7 @@ def test_poles_of_a_loop_in_the_plane() -> None:
     motion = trajectory.at(np.array([0.03])).motion
     angle, speed, rate = (float(x[0, 1]) for x in (motion.q, motion.qd, motion.qdd))
 
-    def inertia(z: np.ndarray) -> np.ndarray:
+    def inertia(z):
         slope = -r * np.sin(z) - r * r * np.sin(z) * np.cos(z) / np.sqrt(
             rod * rod - r * r * np.sin(z) ** 2
         )
@@ -308,7 +206,7 @@ def test_poles_of_a_loop_in_the_plane() -> None:
 # -- how many coordinates the poles need -----------------------------------------------------------
 
 
-def largest_error(poles: np.ndarray, exact: np.ndarray, below: float, slowest: float) -> float:
+def largest_error(poles, exact, below, slowest):
     """Return the largest relative distance of a pole below a frequency, Hz, from its partner."""
     found = [0.0]
     for one, other in ((poles, exact), (exact, poles)):
@@ -322,7 +220,7 @@ def largest_error(poles: np.ndarray, exact: np.ndarray, below: float, slowest: f
     [("controlled_two_arm", 1.0, 500.0, 24), ("spatial_arm", 0.3, 100.0, 16),
      ("four_bar", 0.1, 1000.0, 20)],
 )  # fmt: skip
-def test_poles_hold_what_is_said(name: str, t: float, below: float, many: int) -> None:
+def test_poles_hold_what_is_said(name, t, below, many):
     """Of the demos, one a loop, against far more coordinates: as they are, and as asked for."""
     coarse = ["arms.cells=[20,4,4]"] if name == "spatial_arm" else []
     model = do.Model(ROOT / "demos" / f"{name}.toml", *coarse)
@@ -337,7 +235,7 @@ def test_poles_hold_what_is_said(name: str, t: float, below: float, many: int) -
     assert len(few.poles) < len(enough.poles) < len(exact)
 
 
-def test_as_many_coordinates_as_there_are(monkeypatch) -> None:
+def test_as_many_coordinates_as_there_are(monkeypatch):
     """Of few cells all poles are those of the finite elements; far too many are not tried."""
     few = two_arm("arms.cells=[8,2]", "arms.passive=0", "design.filter_radius=0")
     assert do.Model(scene_from_dict(few)).state_space(1.0, below=1e9).accurate_below == np.inf
@@ -346,7 +244,7 @@ def test_as_many_coordinates_as_there_are(monkeypatch) -> None:
         do.Model(scene_from_dict(few)).state_space(1.0, below=1e9)
 
 
-def test_frequency_below_which_poles_are_pairs() -> None:
+def test_frequency_below_which_poles_are_pairs():
     """The first one that is 0.5 % off, in either set; near zero they are measured by a rate."""
     exact = np.array([1e-4, -1.0 + 99.0j, -200.0, 300.0j])
     assert accurate_below(exact, exact, 1.0) == np.inf
@@ -358,5 +256,5 @@ def test_frequency_below_which_poles_are_pairs() -> None:
         assert found == pytest.approx(0.99 * first / (2.0 * np.pi), rel=1e-5)
 
 
-def test_instant_within_the_motion() -> None:
+def test_instant_within_the_motion():
     refusal(lambda: state_space(open_two_arm(), 4.0), "4 s", "motion.horizon = 3")

@@ -1,19 +1,15 @@
 """What tables hold between two steps of the integrator: nothing is lost, whatever their length."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import Chain, beam
+from bodies import beam, plane_chain
 from machines import distance
-from scipy.integrate import trapezoid
 
 from dolfinopt.dynamics import radau
-from dolfinopt.dynamics.collocation import radau_iia
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.tables import LoadedMotion, Table, stage_values_of
+from dolfinopt.dynamics.tables import LoadedMotion, Table
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.profiling import Profile
@@ -23,39 +19,16 @@ pytestmark = pytest.mark.serial  # arrays of one process
 PULSE = np.array([0.5005, 0.5010, 0.5025, 0.5030])  # s, where it sets in, is up, falls, ends
 
 
-def test_a_polynomial_has_its_own_values() -> None:
-    """Of degree s - 1 the moments' polynomial is itself, whatever rows lie within the steps."""
-    c, grid = radau_iia(4).c, np.array([0.0, 0.3, 0.4, 1.0])
-    cubic = np.polynomial.Polynomial([1.0, -2.0, 3.0, 4.0])
-    found = stage_values_of(lambda t: cubic(t)[:, None], np.array([0.1, 0.11, 0.7]), grid, c)
-    t = (grid[:-1, None] + np.diff(grid)[:, None] * c).ravel()
-    np.testing.assert_allclose(found[:, 0], cubic(t), rtol=1e-12)
-
-
-def test_moments_of_a_pulse_within_a_step() -> None:
-    """int f dt and int f t dt of a step's polynomial are those of the table."""
-    method, grid = radau_iia(3), np.array([0.0, 0.4, 1.0])
-    t = np.array([0.0, *PULSE, 1.0])
-    f = np.array([0.0, 0.0, 7.0, 5.0, 0.0, 0.0])
-    values = Table(t, f[:, None]).at_stages(grid, method.c)[3:, 0]
-    weights = 0.6 * method.A[-1]
-    fine = np.linspace(0.5, 0.51, 20_001)
-    table = np.interp(fine, t, f)
-    assert weights @ values == pytest.approx(trapezoid(table, fine), rel=1e-6)
-    places = 0.4 + 0.6 * method.c
-    assert weights @ (values * places) == pytest.approx(trapezoid(table * fine, fine), rel=1e-6)
-
-
-def still(t: np.ndarray) -> RigidMotion:
+def still(t):
     """Return no motion of cart and two joints."""
     zero = np.zeros((len(t), 3))
     return RigidMotion(zero + np.array([0.0, 0.6, 0.8]), zero, zero)
 
 
-def loaded(rows: np.ndarray) -> MachineSystem:
+def loaded(rows):
     """Return two arms at rest with a pulse of 400 N at the end, in a table of these rows, s."""
     arm = beam(bending=10.0, axial=300.0, damping=1e-3)
-    mechanism = Chain((arm, arm), 1.0, 0.01, (0.0, 0.0), 0.0).mechanism()
+    mechanism = plane_chain([arm.body()] * 2, 1.0, 0.01, (0.0, 0.0), 0.0)
     force = AppliedForce(site=(1, 0), column=0, in_world=True, known=False)
     mechanism = replace(mechanism, forces=(force,))
     t = np.union1d(rows, PULSE)
@@ -66,7 +39,7 @@ def loaded(rows: np.ndarray) -> MachineSystem:
 
 
 @pytest.mark.parametrize("count", [2, 61, 1000, 100_000])
-def test_a_pulse_in_a_table_of_any_length(count: int) -> None:
+def test_a_pulse_in_a_table_of_any_length(count):
     """The same motion as with steps that end at the pulse's corners."""
     alone = loaded(np.array([0.0, 1.0]))
     stepped = replace(alone, breakpoints=(0.0, *PULSE.tolist(), 1.0))
@@ -86,11 +59,11 @@ def test_a_pulse_in_a_table_of_any_length(count: int) -> None:
         ((2e-2, 0.0, 0.0), 0.4567),  # from a rest of whose rounding no step is a small share
     ],
 )
-def test_a_jerk_in_a_table_of_a_motion_is_not_lost(move: tuple[float, ...], begin: float) -> None:
+def test_a_jerk_in_a_table_of_a_motion_is_not_lost(move, begin):
     """Cart or joint move on by mm or mrad within 4 ms, far from any step's end."""
     corners = begin + np.array([0.0, 0.001, 0.003, 0.004])
 
-    def jerk(t: np.ndarray) -> RigidMotion:
+    def jerk(t):
         u = np.clip((t - begin) / 0.004, 0.0, 1.0)
         s = np.stack([u**3 * (10 - 15 * u + 6 * u * u), 30 * u**2 * (1 - u) ** 2 / 0.004,
                       60 * u * (1 - u) * (1 - 2 * u) / 0.004**2])  # fmt: skip

@@ -18,7 +18,6 @@ from dolfinopt.cli import commands
 from dolfinopt.exchange.in_space import in_space, plate_moments
 from dolfinopt.exchange.mbdyn import fem_text, write_fem
 from dolfinopt.exchange.standard_input import load_body, lumped_nodes, modal_element
-from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.multibody.body import BodyMotion, Constants
 from dolfinopt.multibody.shape_integrals import shape_integrals
@@ -26,8 +25,6 @@ from dolfinopt.reduction import Options, craig_bampton
 
 COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT, THICKNESS = 1.2, 0.3, 0.02  # m
-# Gmsh places points to 2e-12 of the length; sums over some hundred nodes lose less.
-PLACING = 1e-10
 
 
 def reduced(cells, comm=MPI.COMM_SELF, uneven=False, stiffened=False, element="linear"):
@@ -111,20 +108,6 @@ def test_round_trip_is_exact(tmp_path, elements, kind, loads):
             assert np.array_equal(groups[group], expected), group
 
 
-def test_interfaces_are_the_first_nodes(parts, elements):
-    body, element = parts[0], elements["plane"]
-    assert np.array_equal(element.points[:2], [[0.0, 0.0, 0.0], [LENGTH, 0.0, 0.0]])
-    assert not element.modes[0].any() and not element.lumped[:2].any()
-    assert np.array_equal(element.modes[1, [0, 1, 5]], body.outboard)
-    assert not element.modes[1, [2, 3, 4]].any()
-    # Mesh nodes of the outboard edge move as the rigid interface does, to the digits of its place.
-    edge = np.abs(element.points[2:, 0] - LENGTH) < 1e-9
-    assert edge.sum() == 4
-    levers = element.points[2:][edge, 1]
-    expected = body.outboard[0] - np.outer(levers, body.outboard[2])
-    np.testing.assert_allclose(element.modes[2:][edge, 0], expected, atol=1e-9)
-
-
 ROUNDING = 1e-12
 
 
@@ -185,20 +168,6 @@ def invariants(element):
         "Inv5": np.einsum("n,nikl->ikl", m, np.cross(phi[:, :, :, None], phi[:, :, None], axis=1)),
         "M": np.einsum("n,nik,nil->kl", m, phi, phi),
     }
-
-
-@pytest.mark.parametrize("name", [*ELEMENTS])
-def test_first_moments_are_exact(name):
-    """Row sums keep what is linear in the shape functions: mass, centre of mass, int Phi."""
-    body, lifted, nodes = reduced((8, 3), uneven=True, element=name)
-    assert len(nodes.points) == (17 * 7 if name == "quadratic" else 9 * 4)
-    found = invariants(modal_element(lifted, nodes))
-    size = body.mass * LENGTH
-    assert found["mass"] == pytest.approx(body.mass, rel=PLACING)
-    np.testing.assert_allclose(found["moment"], [*body.w[:, 0], 0.0], atol=PLACING * size)
-    np.testing.assert_allclose(
-        found["Inv3"][:2], body.w[:, 1:], atol=PLACING * np.abs(body.w[:, 1:]).max()
-    )
 
 
 SMALL = ["--set", "arms.cells=[20,3]", "--set", "arms.arm2.length=0.8"]

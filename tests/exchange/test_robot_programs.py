@@ -18,13 +18,13 @@ ROBOTS = [
 pytestmark = pytest.mark.serial
 
 
-def motion_of(tmp_path: Path, joints: tuple[str, ...]) -> Path:
+def motion_of(tmp_path, joints):
     file = tmp_path / "motion.csv"
     file.write_text(f"t,{','.join(joints)}\n0,0,0\n0.5,0.8,-0.6\n")
     return file
 
 
-def bring(robot: Path, links: str, motion: Path, folder: Path) -> None:
+def bring(robot, links, motion, folder):
     run("import", robot, motion, links, "--out", folder)
 
 

@@ -1,14 +1,12 @@
 """Bodies in the standard's format, of plane and space: round trips, forces by its numbers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import beam, random_cloud, random_tree
+from bodies import random_cloud, random_tree
 from bodies import stiffened as bent
-from readers import State, forces_of_sid, random_state
+from readers import forces_of_sid, random_state
 from runs import refused
 
 from dolfinopt.exchange.in_space import in_space
@@ -17,9 +15,8 @@ from dolfinopt.multibody.body import BodyMotion, Constants
 from dolfinopt.multibody.frames import Interface
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import TABLE, ShapeIntegrals
+from dolfinopt.multibody.shape_integrals import TABLE
 from dolfinopt.scene.sid import (
-    StandardInputData,
     Taylor,
     read_sid,
     write_sid,
@@ -29,15 +26,14 @@ pytestmark = pytest.mark.serial  # ranks have no part in it
 
 # Sums of some dozens of products of numbers of size one; measured: 1e-15.
 ROUNDING = 1e-12
-THICKNESS = 0.02  # m
 
 
-def assert_close(found, expected, tolerance=ROUNDING, size=1.0) -> None:
+def assert_close(found, expected, tolerance=ROUNDING, size=1.0):
     scale = max(size, float(np.abs(expected).max(initial=0.0)))
     assert np.abs(np.asarray(found) - expected).max(initial=0.0) < tolerance * scale
 
 
-def stiffened(body: ShapeIntegrals, seed: int) -> ShapeIntegrals:
+def stiffened(body, seed):
     """Return the body with geometric stiffness, but what the inertia of the modes stiffens.
 
     The format does not hold that.
@@ -46,7 +42,7 @@ def stiffened(body: ShapeIntegrals, seed: int) -> ShapeIntegrals:
     return replace(found, along_modes=np.zeros((0, body.num_modes, body.num_modes)))
 
 
-def body_of(dimension: int, seed: int, q: int) -> ShapeIntegrals:
+def body_of(dimension, seed, q):
     """Return a body with matrices that are symmetric or skew in all bits, as arms have them."""
     body = random_cloud(np.random.default_rng(seed), q, dimension).body()
     if dimension == 3:
@@ -59,11 +55,11 @@ PLANE_AND_SPACE = pytest.mark.parametrize("dimension", [2, 3])
 STIFF = pytest.mark.parametrize("stiff", [False, True])
 
 
-def sid_of(body: ShapeIntegrals, comment: str = "") -> StandardInputData:
+def sid_of(body, comment=""):
     return to_sid(body if len(body.w) == 3 else in_space(body), comment)
 
 
-def same(found: ShapeIntegrals, body: ShapeIntegrals) -> None:
+def same(found, body):
     """Assert that a plane body is back in every bit, one in space to rounding."""
     for one in TABLE:
         a, b = (np.asarray(getattr(x, one.name), dtype=float) for x in (found, body))
@@ -94,7 +90,7 @@ def test_body_of_a_file_in_a_machine(tmp_path, stiff):
     body = random_cloud(rng, 4, 3).body()
     body = stiffened(body, 2) if stiff else body
     write_sid(tmp_path / "a.sid", to_sid(body))
-    tree = random_tree(rng).mechanism()
+    tree = random_tree(rng).mechanism
     motion, rates = RigidMotion(*rng.normal(size=(3, 5, 4))), 0.3 * rng.normal(size=(3, 5, 9))
 
     def forces(one):
@@ -123,17 +119,7 @@ def test_several_interfaces(tmp_path, stiff):
         from_sid(data, 3, further=["tool"])
 
 
-def test_names_hold_frequencies():
-    """sqrt(K / M) of a bar in bending and in tension; other programs read it in Hz."""
-    body = beam().body()
-    data = sid_of(body)
-    found = [float(name.split(":")[1].split("Hz")[0]) for name in data.names]
-    expected = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
-    assert found == pytest.approx(expected, abs=5e-4)  # three decimals
-    assert data.names[0].startswith("Eigen Mode    1 : ")
-
-
-def moving(body: ShapeIntegrals, s: State) -> BodyMotion:
+def moving(body, s):
     frame = tuple(x[:, None] for x in (s.a, s.w, s.g))
     return BodyMotion(Constants(body), frame, np.stack([s.q, s.qd, s.qdd], axis=1)[:, :, None])
 

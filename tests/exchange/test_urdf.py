@@ -1,4 +1,4 @@
-"""Robots from URDF: kinematics and inertia of the scene; solids."""
+"""Robots from URDF: drive forces against Pinocchio's; solids."""
 
 import re
 from types import SimpleNamespace
@@ -6,15 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from mpi4py import MPI
-from robots import DEMO, DEMO_MOTION, frames_of, mechanism_of, run_import, tree_of, write_uneven
+from robots import DEMO, DEMO_MOTION, mechanism_of, run_import, tree_of, write_uneven
 from runs import run
-from scipy.spatial.transform import Rotation
 
 from dolfinopt.arms.arm import build_arms, uniform_design
 from dolfinopt.exchange.urdf import robot as urdf
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
-from dolfinopt.exchange.urdf.robot import roll_pitch_yaw_of, scene_bodies
+from dolfinopt.exchange.urdf.robot import scene_bodies
 from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells
@@ -22,13 +21,11 @@ from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.newton_euler import inverse_dynamics
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.rotations import roll_pitch_yaw
 from dolfinopt.output.summary import filter_warnings
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import read_scene
 
-yourdfpy = pytest.importorskip("yourdfpy")
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 MOVED = 12  # random joint coordinates
@@ -63,53 +60,6 @@ def in_scene(robot, mechanism, q):
     return np.column_stack([by_name[mechanism.joints[i].name] for i in mechanism.movable])
 
 
-def test_the_scene_moves_as_the_robot(imported, rigid):
-    """Frames of all bodies against yourdfpy's, the end-effector's the tool's."""
-    file, (robot, bodies, mechanism) = imported[0], rigid
-    q = random_joints(robot, np.random.default_rng(1))
-    rows = in_scene(robot, mechanism, q)
-    none = np.zeros_like(rows)
-    ends = end_effector(mechanism, RigidMotion(rows, none, none), np.zeros((MOVED, 0)))
-    model = yourdfpy.URDF.load(str(file), load_meshes=False)
-    for k in range(MOVED):
-        own_q = {name: values[k] for name, values in q.items() if name != "other"}
-        if "rail" in own_q:  # whose axis yourdfpy does not make a unit vector
-            own_q["rail"] /= 3.0
-        model.update_cfg(own_q)
-        frames = frames_of(mechanism, rows[k])
-        for body, frame in zip(bodies, frames, strict=True):
-            expected = model.get_transform(body.link)
-            assert np.abs(frame - expected @ body.frame).max() < 1e-12
-        tool = model.get_transform(bodies[-1].link)
-        assert bodies[-1].link in ("tool", "grip")
-        assert np.abs(ends[k] - tool[:3, 3]).max() < 1e-12
-
-
-def test_mass_centre_and_inertia_in_the_world(rigid):
-    """Every link's mass is somewhere; each body's as that of its links."""
-    robot, bodies, mechanism = rigid
-    q = random_joints(robot, np.random.default_rng(2))
-    frames = frames_of(mechanism, in_scene(robot, mechanism, q)[0])
-    poses = robot.poses({name: values[0] for name, values in q.items()})
-    for body, frame, constants in zip(bodies, frames, mechanism.constants, strict=True):
-        expected = urdf.MASSLESS
-        for name in body.links:
-            expected = expected + robot.links[name].own.posed(poses[name])
-        mass = constants.body.mass
-        second = constants.body.W.reshape(3, 3)
-        centre = constants.body.w[:, 0] / mass if mass else np.zeros(3)
-        second = second - mass * np.outer(centre, centre)
-        tensor = frame[:3, :3] @ (np.trace(second) * np.eye(3) - second) @ frame[:3, :3].T
-        assert mass == pytest.approx(expected.mass, rel=1e-15)
-        assert np.abs(tensor - expected.tensor).max() < 1e-12
-        if mass:
-            place = frame[:3, :3] @ centre + frame[:3, 3]
-            assert np.abs(place - expected.centre).max() < 1e-12
-    on_ground = {"world", "foot", "base"}
-    total = sum(link.own.mass for name, link in robot.links.items() if name not in on_ground)
-    assert sum(one.mass for one in mechanism.bodies) == pytest.approx(total, rel=1e-14)
-
-
 def test_drive_forces_against_pinocchio(imported, rigid):
     pin = pytest.importorskip("pinocchio")
     robot, _, mechanism = rigid
@@ -138,17 +88,6 @@ def test_drive_forces_against_pinocchio(imported, rigid):
             assert found[k, column] == pytest.approx(expected, abs=1e-10)
 
 
-def test_roll_pitch_yaw_comes_back():
-    rng = np.random.default_rng(4)
-    some = Rotation.from_rotvec(rng.normal(scale=2.0, size=(20, 3))).as_matrix()
-    quarter = 0.5 * np.pi
-    upright = [roll_pitch_yaw((a, p, b)) for a, b in rng.normal(size=(5, 2)) for p in
-               (quarter, -quarter, quarter - 1e-9, 1e-8 - quarter)]  # fmt: skip
-    for R in (*some, *upright):
-        R = some[0].T @ (some[0] @ R)  # to rounding, as products of poses are
-        assert np.abs(roll_pitch_yaw(roll_pitch_yaw_of(R)) - R).max() < 1e-14
-
-
 def test_a_solid_lies_along_its_link():
     """Between parallel axes, in the middle of the rod beside them; z is the joints' axis."""
     robot = read_robot(DEMO)
@@ -165,24 +104,6 @@ def test_a_solid_lies_along_its_link():
     cells = cells_of(0.5, 0.04, 0.02)
     sides = np.array([0.5, 0.04, 0.02]) / cells
     assert sides.max() < 2.0 * sides.min() and 4000 < np.prod(cells) < 9000
-
-
-def test_solids_of_the_uneven_robot(tmp_path):
-    """Without geometry a guess; what a solid carries without a joint stays."""
-    robot = read_robot(write_uneven(tmp_path))
-    (lower,) = (body for body in scene_bodies(robot, ("lower",), "grip") if body.is_solid)
-    assert not lower.measured and lower.size == pytest.approx([lower.length / 10.0] * 2)
-    assert lower.length == pytest.approx(np.linalg.norm([0.4, 0.05, 0.1]))
-    # Its x axis points to the next joint, its z axis has no component of the joint's across both.
-    direction = lower.frame[:3, 0] * lower.length
-    assert direction == pytest.approx([0.4, 0.05, 0.1])
-    assert abs(lower.frame[:3, 1] @ lower.joint.axis) < 1e-12
-    # With mass as a body on a fixed joint; a frame without mass is only a place.
-    bodies = {body.link: body for body in scene_bodies(robot, ("upper",), "grip")}
-    assert bodies["bracket"].joint.kind == "fixed" and bodies["bracket"].parent == "upper"
-    assert "mark" not in bodies and bodies["slide"].parent == "upper"
-    on_ground = [one.links for one in bodies.values() if one.parent == "ground"]
-    assert on_ground == [("base/turn", "cover")] and list(bodies)[-1] == "grip"
 
 
 def test_the_end_effector_is_the_last_arm(tmp_path):

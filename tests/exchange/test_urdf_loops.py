@@ -1,9 +1,5 @@
 """Closed loops beside a URDF file: `dolfinopt import --closures`."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from robots import tree_of
@@ -56,14 +52,14 @@ axis = [0, 0, 1]
 MOTION = "t,turn,knee,rock\n0,0.5,0.5,-2.0\n1,1.5,0,0\n"
 
 
-def linkage(folder: Path, table: str, motion: str = MOTION) -> tuple[Path, Path, Path]:
+def linkage(folder, table, motion=MOTION):
     files = tuple(folder / name for name in ("linkage.urdf", "loops.toml", "motion.csv"))
     for file, text in zip(files, (LINKAGE, table, motion), strict=True):
         file.write_text(text)
     return files
 
 
-def imported_to(folder: Path, table: str, motion: str = MOTION) -> Path:
+def imported_to(folder, table, motion=MOTION):
     """Import the linkage; return the scene's file."""
     robot, loops, file = linkage(folder, table, motion)
     words = (file, "tool", "--boxes", "--out", folder / "scene")
@@ -71,7 +67,7 @@ def imported_to(folder: Path, table: str, motion: str = MOTION) -> Path:
     return folder / "scene" / "linkage.toml"
 
 
-def test_a_linkage_is_closed(tmp_path) -> None:
+def test_a_linkage_is_closed(tmp_path):
     """Passive joints, the rocker's interface, the assembly by the table's first row."""
     path = imported_to(tmp_path, TABLE.format(kind="pin", link="rocker"))
     tree, scene = tree_of(path), read_scene(path)
@@ -85,7 +81,7 @@ def test_a_linkage_is_closed(tmp_path) -> None:
     assert np.abs(end - 0.25).max() < 1e-10
 
 
-def test_a_driven_rod_is_a_column(tmp_path) -> None:
+def test_a_driven_rod_is_a_column(tmp_path):
     """From a link that is fixed to the rocker; its length stands in the table."""
     table = TABLE.replace("axis = [0, 0, 1]\n", "").replace("[[0.25, 0, 0],", "[[0, 0, 0],")
     table = table.replace('["knee", "rock"]', '["rock"]')
@@ -108,7 +104,7 @@ def test_a_driven_rod_is_a_column(tmp_path) -> None:
         ("passive = [", ("cannot be read as TOML",)),
     ],
 )
-def test_refused(tmp_path, table: str, words: tuple[str, ...]) -> None:
+def test_refused(tmp_path, table, words):
     table = table.replace("{kind}", "pin").replace("{link}", "rocker")
     robot, loops, motion = linkage(tmp_path, table)
     with refused("loops.toml", *words):

@@ -1,36 +1,23 @@
-"""The elements: patch test, bending, rates of convergence; a form of a test's own beside them."""
-
-from __future__ import annotations
+"""The elements: patch test, torsion, rates of convergence; a form of a test's own beside them."""
 
 from functools import cache
 
 import numpy as np
 import pytest
 import solids
-import ufl
 from mpi4py import MPI
 from remainders import bulge
 from runs import ROOT, refusal
 from scipy.sparse.linalg import spsolve
-from solids import POISSON, elastic_link, link_mesh
+from solids import elastic_link, link_mesh
 
 from dolfinopt.fem import forms
 from dolfinopt.fem.elasticity import Substructure
-from dolfinopt.fem.geometric_stiffness import unit_loads
-from dolfinopt.fem.kernels import compile_kernels
-from dolfinopt.fem.laws import isotropic
-from dolfinopt.fem.stress import places_of
 from dolfinopt.fem.tensors import (
-    ElementTensors,
-    condensed,
     element_of,
-    geometry,
-    reference_corners,
     stress_points,
 )
-from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import arm_mesh, box_arm
-from dolfinopt.reduction import Options, craig_bampton
 from dolfinopt.scene.load import Arm
 
 COMM = MPI.COMM_WORLD
@@ -38,33 +25,6 @@ LENGTH, HEIGHT, THICKNESS = 1.0, 0.2, 0.01  # m
 YOUNG, DENSITY = 70e9, 2700.0  # Pa, kg/m3
 # Sums of some hundred rounded terms; Gmsh places points to 2e-12 of the length.
 ROUNDING = 1e-10
-
-
-def assumed_stress(operators: ElementTensors) -> np.ndarray:
-    """Return k_e of another element: bilinear displacements, five stresses a cell.
-
-    H = int P' S P of the compliance S, G = int P' B, k = G' H^-1 G.
-    Source: Pian & Sumihara (1984), doi:10.1002/nme.1620200911.
-    """
-    cell = operators.cell
-    space = ufl.FunctionSpace(cell.mesh, compat.lagrange_element(cell.shape, 0, 5))
-    a, b = ufl.TrialFunction(space), ufl.TestFunction(space)
-    xi, (J0, _) = (2.0 * cell.xi[k] - 1.0 for k in range(2)), forms.centre(cell)
-    ways = [(J0[0, k] ** 2, J0[1, k] ** 2, J0[0, k] * J0[1, k]) for k in range(2)]
-    x, y = xi
-
-    def stress(c):
-        bent = [(c[3] * y * first, c[4] * x * second) for first, second in zip(*ways, strict=True)]
-        return ufl.as_vector([c[k] + sum(bent[k]) for k in range(3)])
-
-    dx, u = cell.dx(2, 2), ufl.TrialFunction(cell.nodal)
-    H = ufl.inner(ufl.dot(cell.C, stress(a)), stress(b)) * dx
-    G = ufl.inner(stress(b), cell.strain(u)) * dx
-    H, G = compile_kernels([H, G])
-    at = np.pad(operators.corners, ((0, 0), (0, 0), (0, 1)))
-    g = G(at, geometry(cell, at, operators.law))
-    h = H(at, geometry(cell, at, np.linalg.inv(operators.law)))
-    return operators.thickness * g.swapaxes(1, 2) @ np.linalg.solve(h, g)
 
 
 def meshed(cells, triangles=False, comm=COMM):
@@ -141,45 +101,6 @@ def test_patch(shape, element):
 
 
 @pytest.mark.serial  # ranks: test_ranks
-@pytest.mark.parametrize(
-    ("element", "exact"), [("incompatible", True), ("linear", False), ("quadratic", True)]
-)
-def test_pure_bending_of_the_reduced_arm(element, exact):
-    """A moment at the tip: rotation L / (E I), strain -y / (E I), in the reduced model, too."""
-    arm = solid_arm(element, meshed((5, 1)), 0.0)
-    basis = craig_bampton(arm, Options(4))
-    q = np.linalg.solve(basis.stiffness, basis.outboard[2])  # by 1 N m
-    bending = YOUNG * THICKNESS * HEIGHT**3 / 12.0
-    rotation = basis.outboard[2] @ q
-    if not exact:  # bilinear cells as long as high resist bending by shear
-        assert rotation < 0.75 * LENGTH / bending
-        return
-    assert rotation == pytest.approx(LENGTH / bending, rel=ROUNDING)
-    # Linear stress: the shear of the bilinear part is recovered away, as is the missing curvature.
-    u = (basis.V @ q)[arm.operators.cells].reshape(arm.mesh.num_cells, 1, -1, 1)
-    points = stress_points(arm.operators.cell)
-    found = (arm.operators.stress(points) @ u)[..., 0]
-    y = places_of(arm.operators, points)[..., 1]
-    assert np.abs(found[..., 0] + y / bending).max() < 1e-9 * HEIGHT / bending
-    assert np.abs(found[..., 1:]).max() < 1e-9 * HEIGHT / bending
-
-
-@pytest.mark.serial  # ranks: test_ranks
-def test_incompatible_modes_are_assumed_stresses_on_parallelograms():
-    """Two elements of other variational principles are the same there, and stay close elsewhere."""
-    nu = 0.33
-    for kind, least, most in (("parallelogram", 0.0, 1e-11), ("distorted", 1e-5, 0.2)):
-        mesh = meshed((8, 3))
-        x = mesh.mesh.geometry.x
-        skew = 0.4 * x[:, 1::-1] * [1.0, 0.2], bulge(x[:, :2], LENGTH, HEIGHT)
-        x[:, :2] += skew[kind == "distorted"]
-        one = solids.tensors_of(mesh, "incompatible", THICKNESS, nu).stiffness
-        other = assumed_stress(solids.tensors_of(mesh, "linear", THICKNESS, nu))
-        apart, size = np.abs(one - other).max(), np.abs(other).max()
-        assert least * size <= apart <= most * size
-
-
-@pytest.mark.serial  # ranks: test_ranks
 def test_a_form_replaced(monkeypatch):
     """K is what the form says: of a law twice as stiff twice as large, mass as it was."""
     before = solids.tensors_of(meshed((4, 2)), "linear", THICKNESS, NU)
@@ -248,24 +169,6 @@ def test_rates_of_convergence(shape, element):
     assert fine < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("name", "triangles"),
-    [*((name, False) for name in forms.ELEMENTS), ("linear", True), ("quadratic", True)],
-)
-def test_ranks(name, triangles):
-    """Stiffness, mass and K0 of the reduced arm do not depend on how many ranks share it."""
-
-    def reduced(comm):
-        arm = solid_arm(name, meshed((12, 4), triangles, comm), 0.33)
-        basis = craig_bampton(arm, Options(5))
-        mass = comm.allreduce(np.tensordot(basis.V, basis.MV, ((0, 1), (0, 1))))
-        return basis.stiffness, mass, unit_loads(arm).geometric_stiffness(basis.V)
-
-    for one, other in zip(reduced(COMM), reduced(MPI.COMM_SELF), strict=True):
-        # Eigenvectors are right to 1e-10.
-        assert np.abs(one - other).max() < 1e-8 * np.abs(other).max()
-
-
 @pytest.mark.serial  # ranks: test_ranks
 def test_element_of_a_mesh():
     quadrilaterals, triangles = meshed((4, 2)), meshed((4, 2), triangles=True)
@@ -287,7 +190,7 @@ CALCULIX = np.array([66.025, 131.345, 410.674, 799.482, 1136.69, 1166.71])
 
 
 @cache
-def frequencies(name: str, shape: str, cells: tuple[int, int, int]) -> np.ndarray:
+def frequencies(name, shape, cells):
     """Return the first six of the link clamped at x = 0, the other end free, Hz."""
     return solids.frequencies(elastic_link(name, link_mesh(shape, cells)), 6)
 
@@ -309,7 +212,7 @@ def test_clamped_link():
     assert 0.0 < errors.min() and errors[:5].max() < 0.005 and errors[5] < 0.025
 
 
-def torsion_constant(element: str, sides: tuple[float, float], cells: tuple[int, int]) -> float:
+def torsion_constant(element, sides, cells):
     """Return J of a slice of cells whose section turns and warps, the same along the slice."""
     long = sides[1] / cells[1]
     mesh = box_arm(MPI.COMM_SELF, "a", (long, *sides), (1, *cells))
@@ -346,18 +249,3 @@ def test_torsion_of_sections(element, height, cells, error):
     exact = height / 3.0 * (1.0 - 192.0 / (np.pi**5 * height) * series)
     found = torsion_constant(element, (height, 1.0), cells)
     assert 100.0 * (found / exact - 1.0) == pytest.approx(error, abs=0.06)
-
-
-@pytest.mark.parametrize("shape", ["quadrilateral", "hexahedron"])
-def test_ways_of_a_cell_without_energy(shape):
-    """Distorted cells have those of a rigid body alone."""
-    cell = forms.Cell(shape, "incompatible")
-    rng, d = np.random.default_rng(2), cell.dim
-    corners = reference_corners(cell) + rng.uniform(-0.15, 0.15, (40, 2**d, d))
-    corners *= [8e-3, 7e-3, 5e-3][:d]
-    at = np.pad(corners, ((0, 0), (0, 0), (0, 3 - d)))
-    [kernel] = compile_kernels(forms.stiffness(cell))
-    k, _, _ = condensed(kernel(at, geometry(cell, at, isotropic(d, POISSON))), d * 2**d)
-    values, rigid = np.linalg.eigvalsh(k), 3 * (d - 1)
-    assert np.abs(values[:, :rigid]).max() < 1e-14 * values[:, -1].min()
-    assert values[:, rigid].min() > 2e-3 * values[:, -1].max()

@@ -1,13 +1,10 @@
 """Compiling forms: once, told in one line; what an interrupted run has left is compiled anew."""
 
-from __future__ import annotations
-
 import logging
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import ufl
 from mpi4py import MPI
 
 from dolfinopt.fem import kernels
@@ -21,7 +18,7 @@ pytestmark = pytest.mark.serial  # ranks have no part in it
 TRIANGLE = Cell("triangle", "linear")
 
 
-def area(factor: float) -> ufl.Form:
+def area(factor):
     return factor * TRIANGLE.dx(0, 0)
 
 
@@ -32,7 +29,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def told(caplog) -> list[str]:
+def told(caplog):
     """Return the lines since the last call."""
     lines = [record.getMessage() for record in caplog.records]
     caplog.clear()

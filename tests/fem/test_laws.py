@@ -1,7 +1,5 @@
 """Material laws: orthotropic ones against closed forms and published beams, laws of one's own."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import solids
@@ -9,9 +7,8 @@ from mpi4py import MPI
 from solids import solid_arm
 from test_elements import SHAPES, distorted
 
-from dolfinopt.fem.laws import Orthotropic, directions, isotropic, turned
+from dolfinopt.fem.laws import Orthotropic, directions, turned
 from dolfinopt.fem.tensors import ElementTensors, stress_points
-from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.sensitivity import static_response
 from dolfinopt.scene.tables.material import Material
@@ -112,28 +109,3 @@ def test_published_beams(degrees, measured):
     found = solids.frequencies(arm.state(arm.uniform(1.0)).elastic, 8)
     nearest = [found[np.abs(found - one).argmin()] for one in measured]
     assert nearest == pytest.approx(measured, rel=0.04)
-
-
-@pytest.mark.serial
-def test_directions_in_space():
-    """Quarter turns change the names of directions; what is isotropic stays."""
-    constants = {"young_modulus": (140e9, 10e9, 5e9), "shear_modulus": (4e9, 2e9, 3e9)}
-    constants["poisson_ratio"] = (0.3, 0.4, 0.2)
-    mesh = box_arm(MPI.COMM_SELF, "a", (1.0, 0.1, 0.1), (2, 1, 1))
-
-    def moduli(angle, axis=None):
-        solid = material(**constants, angle=angle, angle_axis=axis)
-        C = turned(Orthotropic(solid).tensor(3), directions(mesh, solid))
-        return 140.0 / np.diag(np.linalg.inv(C))  # of x, y, z; xy, yz, zx in GPa
-
-    quarter = 0.5 * np.pi
-    assert moduli(None) == pytest.approx([140, 10, 5, 4, 2, 3])
-    assert moduli(quarter) == pytest.approx([10, 140, 5, 4, 3, 2])
-    assert moduli(quarter, (0.0, 2.0, 0.0)) == pytest.approx([5, 10, 140, 2, 4, 3])
-    assert moduli(quarter, (1.0, 0.0, 0.0)) == pytest.approx([140, 5, 10, 3, 2, 4])
-    assert moduli(2.0 * quarter / 1.5, (1.0, 1.0, 1.0)) == pytest.approx([5, 140, 10, 3, 4, 2])
-    for dim in (2, 3):
-        C = isotropic(dim, 0.3)
-        turn = directions(mesh, material(angle=0.7, angle_axis=(1.0, 2.0, 3.0)))[:dim, :dim]
-        turn = turn if dim == 3 else np.array([[0.6, 0.8], [-0.8, 0.6]])
-        assert turned(C, turn) == pytest.approx(C, abs=1e-14)

@@ -1,7 +1,5 @@
 """Derivatives of what cells add to by the places of their corners, against differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from dolfinx.mesh import CellType, create_rectangle
@@ -10,15 +8,10 @@ from mpi4py import MPI
 from solids import link_mesh, tensors_of
 
 from dolfinopt.fem import forms
-from dolfinopt.fem.assembly import Cells, StiffenedModes
-from dolfinopt.fem.frames import by_rigid_motions, rigid_motions
 from dolfinopt.fem.shape_derivative import ShapeDerivative
-from dolfinopt.fem.stress import stress_operator
-from dolfinopt.fem.tensors import stress_points
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh
 from dolfinopt.mesh.checks import cell_sizes
-from dolfinopt.reduction import by_frame_fields
 
 pytestmark = pytest.mark.serial  # ranks have no part in it
 
@@ -31,7 +24,7 @@ ELEMENTS_OF = [
 ]  # fmt: skip
 
 
-def even_mesh(shape: str) -> ArmMesh:
+def even_mesh(shape):
     """Return a regular mesh of these cells."""
     if shape in ("triangle", "quadrilateral"):
         corners = [np.array([0.0, -0.02]), np.array([0.2, 0.02])]
@@ -45,72 +38,20 @@ def even_mesh(shape: str) -> ArmMesh:
     return link_mesh(shape, (3, 2, 1))
 
 
-def direction(mesh: ArmMesh) -> np.ndarray:
+def direction(mesh):
     """Return random moves (n, d) of a regular mesh's nodes, m."""
     return SIZE * noise("a", mesh.mesh.geometry.x[:, : mesh.dim])
 
 
-def mesh_of(shape: str, h: float) -> ArmMesh:
+def mesh_of(shape, h):
     """Return an uneven mesh, its nodes moved by h times `direction`."""
     even = even_mesh(shape)
     uneven = SIZE * noise("a", even.mesh.geometry.x[:, : even.dim], 5)
     return with_moves(even, uneven + h * direction(even))
 
 
-def functions(shape: str, element: str, h: float, weights: dict) -> dict[str, float]:
-    """Return what cells of a moved mesh add up to, with random weights."""
-    mesh = mesh_of(shape, h)
-    operators = tensors_of(mesh, element, 0.01 if mesh.dim == 2 else 1.0, 0.3)
-    cells = Cells(operators)
-    u, v, e = weights["u"], weights["v"], weights["e"]
-    K0 = StiffenedModes(cells, u, e, v).stiffness()
-    operator = stress_operator(operators, stress_points(operators.cell))
-    s = 3 if mesh.dim == 2 else 5
-    stress = operator @ u.reshape(operator.shape[1], -1)
-    return {
-        "stiffness": float(e @ cells.stiffness_products(u, v)),
-        "mass": float(e @ cells.mass_products(u, v)),
-        "volume": float(e @ mesh.area),
-        "geometric stiffness": float(np.sum(weights["K0"] * K0)),
-        "stress": float(np.sum(weights["s"] * stress.reshape(s, -1, u.shape[2]))),
-        "points": float(np.sum(weights["x"] * operators.points)),
-    }
-
-
 @pytest.mark.parametrize(("shape", "element"), ELEMENTS_OF)
-def test_derivatives_of_cells(shape: str, element: str) -> None:
-    """Of uneven cells, random fields: central differences leave their square, 1e-8."""
-    mesh, rng = mesh_of(shape, 0.0), np.random.default_rng(3)
-    operators = tensors_of(mesh, element, 0.01 if mesh.dim == 2 else 1.0, 0.3)
-    n, count, d, k = len(operators.points), mesh.num_cells, mesh.dim, 2
-    points = stress_points(operators.cell)
-    u, v = rng.normal(size=(2, n, d, k))
-    weights = {
-        "u": u, "v": v, "e": rng.uniform(1.0, 2.0, count), "K0": rng.normal(size=(k, k, k)),
-        "s": rng.normal(size=(3 if d == 2 else 5, count * len(points), k)),
-        "x": rng.normal(size=(n, d)),
-    }  # fmt: skip
-    shape_of = ShapeDerivative(operators)
-    e = weights["e"]
-    found = {
-        "stiffness": shape_of.stiffness(u, v, e),
-        "mass": shape_of.mass(u, v, e),
-        "volume": shape_of.volume(e),
-        "geometric stiffness": shape_of.geometric_stiffness(u, v, weights["K0"], e),
-        "stress": shape_of.stress(points, weights["s"], u),
-    }
-    by_nodes = {name: shape_of.at_nodes(one) for name, one in found.items()}
-    by_nodes["points"] = shape_of.from_points(weights["x"])
-    moves = direction(even_mesh(shape))
-    ends = [functions(shape, element, h, weights) for h in (STEP, -STEP)]
-    for name, one in by_nodes.items():
-        expected = (ends[0][name] - ends[1][name]) / (2.0 * STEP)
-        terms = np.abs(one * moves).sum()
-        assert np.sum(one * moves) == pytest.approx(expected, abs=1e-6 * terms), name
-
-
-@pytest.mark.parametrize(("shape", "element"), ELEMENTS_OF)
-def test_the_same_by_ufl(shape: str, element: str) -> None:
+def test_the_same_by_ufl(shape, element):
     """Eshelby's tensor against UFL's derivative of the form, to rounding."""
     operators = tensors_of(mesh_of(shape, 0.0), element, 1.0, 0.3)
     cell, derivative = operators.cell, ShapeDerivative(operators)
@@ -121,14 +62,3 @@ def test_the_same_by_ufl(shape: str, element: str) -> None:
     by_ufl = sum(derivative.run(forms.by_corners, known, forms.stiffness_product))
     found = derivative.stiffness(u, u, young)
     assert np.abs(found - by_ufl.reshape(found.shape)).max() < 1e-12 * np.abs(by_ufl).max()
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_places_by_rigid_motions(dim: int) -> None:
-    """They are linear in the points but for translations, so that products are the same."""
-    X = np.random.default_rng(1).normal(size=(5, dim))
-    by = np.random.default_rng(2).normal(size=rigid_motions(X).shape)
-    turns = rigid_motions(X)[:, :, dim:]
-    assert np.sum(by_rigid_motions(by) * X) == pytest.approx(np.sum(by[:, :, dim:] * turns))
-    order = [1, 2, 0] if dim == 2 else [1, 2, 5, 4, 3, 0]
-    assert by_frame_fields(by[:, :, order]) == pytest.approx(by_rigid_motions(by))

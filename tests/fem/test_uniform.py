@@ -1,7 +1,5 @@
 """Cells that are all alike: one matrix for all gives what every cell's own gives."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np
@@ -10,8 +8,8 @@ from mpi4py import MPI
 from solids import tensors_of
 
 from dolfinopt.fem import assembly
-from dolfinopt.fem.assembly import CellMatrix, Cells, NodePairs
-from dolfinopt.fem.elasticity import ElasticArm, Substructure
+from dolfinopt.fem.assembly import Cells
+from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.fem.geometric_stiffness import unit_loads
 from dolfinopt.mesh.arm_mesh import box_arm
@@ -20,7 +18,7 @@ COMM = MPI.COMM_WORLD
 LENGTH, HEIGHT, CELLS = 1.0, 0.06, (30, 5)
 
 
-def make_arm(element: str, shift: float = 0.0) -> ElasticArm:
+def make_arm(element, shift=0.0):
     """Return an arm of random materials; nodes off their places by `shift` of a cell at random."""
     mesh = box_arm(COMM, "arm", (LENGTH, HEIGHT), CELLS)
     points = mesh.mesh.geometry.x
@@ -32,7 +30,7 @@ def make_arm(element: str, shift: float = 0.0) -> ElasticArm:
     return sub.at(70e9 * wave**3, 2700.0 * wave)
 
 
-def cell_by_cell(arm: ElasticArm) -> ElasticArm:
+def cell_by_cell(arm):
     """Return the same arm, its cells told apart."""
     other = copy.copy(arm)
     own = other.substructure = copy.copy(arm.substructure)
@@ -44,13 +42,13 @@ def cell_by_cell(arm: ElasticArm) -> ElasticArm:
     return other
 
 
-def fields(arm: ElasticArm, seed: float, columns: int) -> np.ndarray:
+def fields(arm, seed, columns):
     x, y = arm.points.T[:, :, None, None] * np.ones((1, 1, 2, columns))
     k = seed + np.arange(columns)
     return np.sin(3.0 * k * x) + k * y * np.array([1.0, -1.0])[:, None] + 5.0
 
 
-def largest(values: np.ndarray) -> float:
+def largest(values):
     return COMM.allreduce(np.abs(values).max(initial=0.0), op=MPI.MAX)
 
 
@@ -59,7 +57,7 @@ EVERY = [pytest.param(one, marks=[pytest.mark.serial] * (one != ON_RANKS)) for o
 
 
 @pytest.mark.parametrize("element", EVERY)
-def test_one_matrix_for_all_cells(element: str) -> None:
+def test_one_matrix_for_all_cells(element):
     arm = make_arm(element)
     other = cell_by_cell(arm)
     assert len(arm.substructure.cells.stiffness) == 1
@@ -74,7 +72,7 @@ def test_one_matrix_for_all_cells(element: str) -> None:
 
 
 @pytest.mark.parametrize("element", EVERY)
-def test_one_tensor_for_all_cells(monkeypatch, element) -> None:
+def test_one_tensor_for_all_cells(monkeypatch, element):
     """Geometric stiffness and its derivatives, without the quadrature points, 7 cells at a time."""
     monkeypatch.setattr(assembly, "STRESS_CHUNK_ENTRIES", 1)
     monkeypatch.setattr(assembly, "STRESS_CHUNK_CELLS", 7)
@@ -99,7 +97,7 @@ def test_one_tensor_for_all_cells(monkeypatch, element) -> None:
 
 
 @pytest.mark.serial  # ranks have no part in it
-def test_cells_that_are_not_alike() -> None:
+def test_cells_that_are_not_alike():
     """A node that is off its place by a thousandth of a cell makes its cells their own."""
     arm = make_arm("linear", 1e-3)
     count = arm.mesh.num_cells
@@ -108,27 +106,9 @@ def test_cells_that_are_not_alike() -> None:
     assert len(make_arm("linear", 1e-13).substructure.cells.stiffness) == 1
 
 
-def test_nodes_of_a_grid_lie_on_its_lines() -> None:
+def test_nodes_of_a_grid_lie_on_its_lines():
     """Gmsh places them to 1e-14 m, which is far more than their rounding."""
     points = box_arm(COMM, "arm", (LENGTH, HEIGHT), (400, 3)).mesh.geometry.x
     for values, first, step in ((points[:, 0], 0.0, 0.0025), (points[:, 1], -0.03, 0.02)):
         lines = first + step * np.rint((values - first) / step)
         assert np.array_equal(values, lines)
-
-
-@pytest.mark.serial
-def test_matrices_of_blocks():
-    """By pairs of nodes, of one matrix or each cell's own: what the entries one by one give."""
-    cells = np.array([[0, 1, 2, 4], [4, 2, 3, 5], [1, 2, 3, 0]])
-    rng = np.random.default_rng(1)
-    for b in (1, 3):
-        elements = rng.standard_normal((3, 4 * b, 4 * b))
-        elements += elements.swapaxes(1, 2)
-        dofs = (b * cells[:, :, None] + np.arange(b)).reshape(3, 4 * b)
-        scale = np.array([2.0, 0.0, -1.0])
-        for given in (elements, elements[:1]):
-            found = CellMatrix(NodePairs(cells, 6), given).assemble(scale)
-            right = np.zeros((6 * b, 6 * b))
-            for own, s, A in zip(dofs, scale, np.broadcast_to(given, elements.shape), strict=True):
-                right[np.ix_(own, own)] += s * A
-            assert np.allclose(found.toarray(), right, rtol=1e-14, atol=1e-14)

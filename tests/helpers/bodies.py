@@ -2,13 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
 
 from dolfinopt.multibody.body import Constants
 from dolfinopt.multibody.rotations import skew
@@ -202,166 +200,93 @@ def beam(
     return Cloud(points, np.full(24, mass / 24), modes, K, damping * K, outboard, ends)
 
 
-# -- chains in the plane ---------------------------------------------------------------------
+# -- machines as points ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Chain:
-    """Clouds on a cart by Lagrange's equations; y = (x_cart, angles, elastic coordinates).
+class PointMachine:
+    """Clouds joined as a tree, by Newton's law for every point; y = (joints, motors, elastic).
 
-    Positions are those of real rotation matrices, so that a complex step differentiates them to
-    rounding. With K0 (7 + q, q, q), by the seven loads and L of the modes, bodies deform in the
-    second order: first moment s, inertia J, angular momentum h of the relative motion, outboard
-    interface and the displacement q along the modes lose 1/2 q'K0 q by the load that works on them.
+    Attributes:
+        mechanism: the same of shape integrals.
+        clouds, joints: one for every body, in space.
+        carried: rigid, by body and interface.
+        gravity: (3,), m/s2.
     """
 
+    mechanism: Mechanism
     clouds: tuple[Cloud, ...]
-    payload_mass: float
-    payload_inertia: float
-    gravity: tuple[float, float]
-    joint_height: float
-    joints: tuple[JointHardware, ...] = ()
-    cart_mass: float = 0.0
-    K0: tuple[np.ndarray, ...] = ()
+    joints: tuple[Joint, ...]
+    carried: Mapping[Site, Cloud]
+    gravity: np.ndarray
 
-    @property
-    def rigid(self) -> int:
-        """Number of rigid coordinates."""
-        return 1 + len(self.clouds)
-
-    @property
-    def size(self) -> int:
-        """Number of all coordinates."""
-        return self.rigid + sum(len(cloud.K) for cloud in self.clouds)
-
-    @cached_property
-    def bodies(self) -> tuple[ShapeIntegrals, ...]:
-        """The same as shape integrals, with geometric stiffness if there is any."""
-        bodies = tuple(cloud.body() for cloud in self.clouds)
-        return tuple(
-            replace(body, K0=K0[:4], K0_outboard=K0[4:7], along_modes=K0[7:])
-            for body, K0 in zip(bodies, self.K0)
-        ) or bodies  # fmt: skip
-
-    def mechanism(self) -> Mechanism:
-        """Return the same chain of shape integrals."""
-        load = self.payload_mass, self.payload_inertia
-        own = self.gravity, self.joint_height
-        return plane_chain(self.bodies, *load, *own, hardware=self.joints, cart_mass=self.cart_mass)
-
-    def parts(self, y: np.ndarray) -> list[np.ndarray]:
-        """Return each arm's elastic coordinates."""
-        return np.split(y[self.rigid :], np.cumsum([len(cloud.K) for cloud in self.clouds])[:-1])
-
-    def frames(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the arms' origins and outboard places (1 + arms, 2), angles before and behind."""
-        origins, behind = [np.array([y[0], self.joint_height])], []
-        angles, angle = [], np.zeros((), dtype=y.dtype)
-        for k, (cloud, e) in enumerate(zip(self.clouds, self.parts(y), strict=True)):
-            bent = np.array([e @ A @ e for A in self.K0[k][4:7]]) if self.K0 else np.zeros(3)
-            u = cloud.outboard @ e - 0.5 * bent
-            angles.append(angle + y[1 + k])
-            origins.append(origins[-1] + rotation(angles[-1]) @ (cloud.ends[0] + u[:2]))
-            angle = angles[-1] + u[2]
-            behind.append(angle)
-        return np.array(origins), np.array(angles), np.array(behind)
-
-    def points(self, y: np.ndarray) -> np.ndarray:
-        """Return the places (n, 2) of all point masses."""
-        origins, angles, _ = self.frames(y)
-        parts = zip(self.clouds, self.parts(y), origins, angles)
-        return np.concatenate(
-            [o + (c.points + c.modes @ e) @ rotation(a).T for c, e, o, a in parts]
-        )
-
-    @property
-    def carried(self) -> np.ndarray:
-        """Masses and inertias (2, arms) at the outboard interfaces, kg and kg m2."""
-        found = np.zeros((2, len(self.clouds)))
-        for k, joint in enumerate(self.joints):
-            found[:, k] = joint.mass, joint.inertia
-        found[:, -1] += self.payload_mass, self.payload_inertia
-        return found
-
-    def momentum_product(self, y: np.ndarray, u: np.ndarray, v: np.ndarray) -> float:
-        """Return u' M(y) v from the velocities of points and interfaces, or by the integrals."""
-
-        def along(function: Callable[[np.ndarray], Any], x: np.ndarray) -> Any:
-            found = function(y + 1j * STEP * x)
-            return [np.imag(z) / STEP for z in found] if isinstance(found, tuple) else (
-                np.imag(found) / STEP
-            )  # fmt: skip
-
-        (p, a, b), (r, c, d) = (along(self.frames, x) for x in (u, v))
-        masses, inertias = self.carried
-        total = self.cart_mass * u[0] * v[0]
-        total += masses @ (p[1:] * r[1:]).sum(axis=1) + inertias @ (b * d)
-        for k, joint in enumerate(self.joints):
-            assert joint.rotor is not None
-            spins = [
-                (behind[k - 1] if k else 0.0) + joint.rotor.ratio * x[1 + k]
-                for behind, x in ((b, u), (d, v))
-            ]
-            total += joint.rotor.inertia * spins[0] * spins[1]
-        if not self.K0:
-            m = np.concatenate([cloud.masses for cloud in self.clouds])
-            return total + np.einsum("n,ni,ni->", m, along(self.points, u), along(self.points, v))
-        angles = self.frames(y)[1]
-        for k, (body, K0) in enumerate(zip(self.bodies, self.K0)):
-            e, R = self.parts(y)[k], rotation(angles[k])
-            s = body.w[:, 0] + body.w[:, 1:] @ e - 0.5 * np.array([e @ A @ e for A in K0[:2]])
-            L = e @ K0[7:]
-            z, turn = e - 0.5 * L @ e, np.eye(len(e)) - L
-            J = body.W[0, 0, 0] + 2.0 * body.W[0, 0, 1:] @ e - e @ K0[3] @ e + z @ body.M @ z
-            by_s, by_h = (
-                body.w[:, 1:] - e @ K0[:2],
-                body.W[1, 1:, 0] + turn.T @ body.W[1, 1:, 1:] @ z - K0[2] @ e,
-            )
-            around = np.array([-s[1], s[0]])
-            (v1, w1, s1, h1, e1), (v2, w2, s2, h2, e2) = (
-                (R.T @ place[k], turned[k], by_s @ ed, by_h @ ed, turn @ ed)
-                for place, turned, ed in ((p, a, self.parts(u)[k]), (r, c, self.parts(v)[k]))
-            )
-            total += body.mass * v1 @ v2 + v1 @ (s2 + w2 * around) + v2 @ (s1 + w1 * around)
-            total += J * w1 * w2 + w1 * h2 + w2 * h1 + e1 @ body.M @ e2
-        return total
-
-    def kinetic(self, y: np.ndarray, yd: np.ndarray) -> float:
-        """Return T, J."""
-        return 0.5 * self.momentum_product(y, yd, yd)
-
-    def potential(self, y: np.ndarray) -> float:
-        """Return the potential of gravity and elasticity, J."""
-        origins, angles, _ = self.frames(y)
-        weight, elastic = self.carried[0] @ origins[1:], 0.0
-        for k, (body, e) in enumerate(zip(self.bodies, self.parts(y))):
-            s = body.w[:, 0] + body.w[:, 1:] @ e
-            if self.K0:
-                s = s - 0.5 * np.array([e @ A @ e for A in self.K0[k][:2]])
-            weight = weight + body.mass * origins[k] + rotation(angles[k]) @ s
-            elastic += 0.5 * e @ body.K @ e
-        return elastic - weight @ np.array(self.gravity)
+    def places(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return masses (n,) and places (n, 3) of all points, and the last body's interface."""
+        motors = sum(j.coordinate is not None for j in self.joints)
+        first = motors + sum(j.rotor is not None and j.rotor.motor is not None for j in self.joints)
+        ends, found = {(GROUND, 0): (np.zeros(3), np.eye(3))}, []
+        for i, (joint, cloud) in enumerate(zip(self.joints, self.clouds, strict=True)):
+            origin, R = ends[joint.parent, joint.interface]
+            origin, R = origin + R @ joint.origin, R @ joint.rotation
+            if (rotor := joint.rotor) is not None:
+                k = joint.coordinate if rotor.motor is None else motors + rotor.motor
+                ring, spun = rotor_points(rotor.inertia, joint.axis), rotor.ratio * y[k]
+                found.append((ring.masses, origin + ring.points @ (R @ turn(spun * joint.axis)).T))
+            if joint.kind == "revolute":
+                R = R @ turn(y[joint.coordinate] * joint.axis)
+            elif joint.kind == "prismatic":
+                origin = origin + y[joint.coordinate] * R @ joint.axis
+            e, first = y[first : first + len(cloud.K)], first + len(cloud.K)
+            found.append((cloud.masses, origin + (cloud.points + cloud.modes @ e) @ R.T))
+            for s, point in enumerate(cloud.ends):
+                u = cloud.outboard[6 * s : 6 * s + 6] @ e
+                there, E = origin + R @ (point + u[:3]), R @ turn(u[3:])
+                ends[i, s] = there, E
+                if (load := self.carried.get((i, s))) is not None:
+                    found.append((load.masses, there + load.points @ E.T))
+        masses, points = zip(*found)
+        return np.concatenate(masses), np.concatenate(points), ends[len(self.clouds) - 1, 0][0]
 
     def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
-        """Return d/dt dT/dyd - dT/dy + dV/dy + D yd by numerical differentiation."""
-        unit = np.eye(self.size)
+        """Return the generalised force of every coordinate: sum m J' (p'' - g) + K e + D e'."""
 
-        def momentum(t: float) -> np.ndarray:
-            here, speed = y + t * yd + 0.5 * t * t * ydd, yd + t * ydd
-            return np.array([self.momentum_product(here, e, speed) for e in unit])
+        def speeds(here: np.ndarray, along: np.ndarray) -> np.ndarray:
+            return complex_derivative(lambda h: self.places(here + h * along)[1])
 
-        def lagrangian(t: float) -> np.ndarray:
-            return np.array([self.kinetic(y + t * e, yd) - self.potential(y + t * e) for e in unit])
-
-        damping = [c.D @ e for c, e in zip(self.clouds, self.parts(yd), strict=True)]
-        lost = np.concatenate([np.zeros(self.rigid), *damping])
-        return derivative(momentum) - derivative(lagrangian) + lost
-
-
-COORDINATES = (2, 3, 1)  # of the arms from the cart outwards
+        second = derivative(lambda t: speeds(y + t * yd + 0.5 * t * t * ydd, yd + t * ydd), 2e-3)
+        J = [speeds(y, unit) for unit in np.eye(len(y))]
+        out = np.einsum("n,kni,ni->k", self.places(y)[0], J, second - self.gravity)
+        first = len(y) - sum(len(cloud.K) for cloud in self.clouds)
+        for cloud in self.clouds:
+            part = slice(first, first := first + len(cloud.K))
+            out[part] += cloud.K @ y[part] + cloud.D @ yd[part]
+        return out
 
 
-# Motors, gearboxes and bearings at the outboard interfaces, and rotors of the joints.
+def turn(theta: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) by a rotation vector, real or complex."""
+    return expm(skew(theta))
+
+
+def rigid_cloud(points: ArrayLike, masses: ArrayLike) -> Cloud:
+    """Return a rigid body in space whose interface is its origin."""
+    X, none = np.array(points, dtype=float), np.zeros((0, 0))
+    modes, outboard = np.zeros((len(X), 3, 0)), np.zeros((6, 0))
+    return Cloud(X, np.array(masses), modes, none, none, outboard, np.zeros((1, 3)))
+
+
+def rotor_points(inertia: float, axis: np.ndarray) -> Cloud:
+    """Return a moment of inertia about an axis and nothing else: a ring without its mass.
+
+    Negative masses on the axis take away the ring's mass and its inertia across the axis.
+    """
+    radius, across = 0.7, np.linalg.svd(axis[None])[2][1:]
+    mass = inertia / radius**2
+    on_axis = radius * np.sqrt(0.5) * axis
+    points = [*(radius * across), *(-radius * across), on_axis, -on_axis]
+    return rigid_cloud(points, [0.25 * mass] * 4 + [-0.5 * mass] * 2)
+
+
 def spatial_mechanism(
     bodies: Sequence[ShapeIntegrals],
     joints: Sequence[Joint],
@@ -375,186 +300,37 @@ def spatial_mechanism(
     return Mechanism(tuple(bodies), tuple(joints), loads, down, end, np.zeros(3))
 
 
-HARDWARE = tuple(JointHardware(0.1 * k, 0.05 * k, Rotor(0.2 / k, 0.5 * k)) for k in (1, 2, 3))
-
-
 def random_chain(
-    rng: np.random.Generator,
-    arms: int,
-    bent: bool = False,
-    coordinates: tuple[int, ...] = COORDINATES,
-) -> Chain:
-    """Return a chain of random clouds with payload and gravity in both directions."""
-    clouds = tuple(random_cloud(rng, q) for q in coordinates[:arms])
-    K0 = [0.05 * rng.normal(size=(7 + q, q, q)) for q in coordinates[:arms] * bent]
-    stiffness = tuple(A + A.swapaxes(1, 2) for A in K0)
-    return Chain(clouds, 0.8, 0.3, (1.0, -2.0), -0.4, HARDWARE[:arms], 0.6, stiffness)
+    rng: np.random.Generator, arms: int, coordinates: tuple[int, ...] = (2, 3, 1)
+) -> PointMachine:
+    """Return a chain of random clouds in the plane with payload and gravity in both directions."""
+    clouds = [random_cloud(rng, q) for q in coordinates[:arms]]
+    hardware = [JointHardware(0.1 * k, 0.05 * k, Rotor(0.2 / k, 0.5 * k)) for k in (1, 2, 3)][:arms]
+    mechanism = plane_chain(
+        [one.body() for one in clouds], 0.8, 0.3, (1.0, -2.0), -0.4,
+        hardware=hardware, cart_mass=0.6,
+    )  # fmt: skip
+    x, _, z = np.eye(3)
+    joints, carried = [Joint("cart", "prismatic", GROUND, 0, x, np.array([0.0, -0.4, 0.0]))], {}
+    for k, one in enumerate(hardware):
+        joints.append(Joint("joint", "revolute", k, 1 + k, z, rotor=one.rotor))
+        last = k == arms - 1
+        mass, inertia = one.mass + 0.8 * last, one.inertia + 0.3 * last
+        ends = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+        carried[1 + k, 0] = rigid_cloud(ends, [0.5 * inertia, 0.5 * inertia, mass - inertia])
+    bodies = rigid_cloud([[0.0, 0.0, 0.0]], [0.6]), *map(in_space, clouds)
+    return PointMachine(mechanism, bodies, tuple(joints), carried, np.array([1.0, -2.0, 0.0]))
 
 
-def rotation(angle: np.ndarray) -> np.ndarray:
-    """Return the matrix that turns by an angle."""
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+def in_space(cloud: Cloud) -> Cloud:
+    """Return a plane body among those in space."""
+    points, ends = (np.pad(x, ((0, 0), (0, 1))) for x in (cloud.points, cloud.ends))
+    modes = np.pad(cloud.modes, ((0, 0), (0, 1), (0, 0)))
+    outboard = np.insert(cloud.outboard, [2, 2, 2], 0.0, axis=0)
+    return replace(cloud, points=points, ends=ends, modes=modes, outboard=outboard)
 
 
-# -- trees in space --------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class CloudTree:
-    """Clouds joined as a tree, by Newton's law for every point; y = (joints, motors, elastic).
-
-    Rotors are rings of points that turn about the joint's axis on what the joint sits on. The
-    mechanism carries their masses along the axis, which has all but the moment of inertia about it.
-    """
-
-    clouds: tuple[Cloud, ...]
-    joints: tuple[Joint, ...]
-    carried: dict[tuple[int, int], Cloud]  # by arm and interface; rigid
-    gravity: np.ndarray
-    end: int
-
-    def mechanism(self) -> Mechanism:
-        """Return the same tree of shape integrals."""
-        every = dict(self.carried)
-        for site, axial in self._axial:
-            other = every.get(site)
-            every[site] = axial if other is None else _together(axial, other)
-        carried = {site: one.body() for site, one in every.items()}
-        bodies = [cloud.body() for cloud in self.clouds]
-        return spatial_mechanism(bodies, self.joints, carried, self.gravity, (self.end, 0))
-
-    @property
-    def _motors(self) -> int:
-        """Number of motors with coordinates of their own."""
-        return sum(j.rotor is not None and j.rotor.motor is not None for j in self.joints)
-
-    @property
-    def rigid(self) -> int:
-        """Number of coordinates of joints and motors."""
-        return sum(joint.coordinate is not None for joint in self.joints) + self._motors
-
-    @property
-    def _axial(self) -> list[tuple[tuple[int, int], Cloud]]:
-        """Masses along the rotors' axes on what carries them."""
-        found = []
-        for joint in self.joints:
-            if joint.rotor is not None and joint.parent != GROUND:
-                masses = _ring(joint.rotor.inertia)[1]
-                size = np.sqrt(0.5 * joint.rotor.inertia / masses.sum())
-                along = size * np.outer([1.0, -1.0, 1.0, -1.0], joint.rotation @ joint.axis)
-                found.append(
-                    ((joint.parent, joint.interface), _rigid(joint.origin + along, masses))
-                )
-        return found
-
-    def forces(self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray) -> np.ndarray:
-        """Return the generalised force of every coordinate: sum m J' (p'' - g) + K e + D e'."""
-        masses, _, second = self._points(y, yd, ydd)
-        none = np.zeros_like(y)
-        steps = 1j * STEP * np.eye(len(y))
-        J = [self._points(y + step, none, none)[1].imag / STEP for step in steps]
-        out = np.einsum("n,kni,ni->k", masses, J, second - self.gravity)
-        first = self.rigid
-        for cloud in self.clouds:
-            part = slice(first, first + len(cloud.K))
-            out[part] += cloud.K @ y[part] + cloud.D @ yd[part]
-            first = part.stop
-        return out
-
-    def _points(
-        self, y: np.ndarray, yd: np.ndarray, ydd: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return masses (n,), places and accelerations (n, 3) of all points.
-
-        Every frame is the product of exponentials of 4 x 4 matrices along y + yd t + ydd t^2 / 2,
-        taken as polynomials of t by blocks: exp of a block Toeplitz matrix holds its series.
-        """
-        series = (y, yd, 0.5 * ydd)
-        ends: dict[tuple[int, int], np.ndarray] = {(GROUND, 0): _polynomial(np.eye(4))}
-        first, joints = self.rigid, self.rigid - self._motors
-        masses, places, second = [], [], []
-        for i, (joint, cloud) in enumerate(zip(self.joints, self.clouds, strict=True)):
-            part = slice(first, first + len(cloud.K))
-            first = part.stop
-            frame = ends[joint.parent, joint.interface]
-            frame = frame @ _polynomial(_place(joint.rotation, joint.origin))
-            bodies = []
-            if (rotor := joint.rotor) is not None and joint.parent != GROUND:
-                k = joint.coordinate if rotor.motor is None else joints + rotor.motor
-                turns = _place(skew(joint.axis), np.zeros(3))
-                turns[3, 3] = 0.0
-                spun = frame @ expm(_polynomial(*(rotor.ratio * turns * c[k] for c in series)))
-                ring, mass = _ring(rotor.inertia)
-                across = np.linalg.svd(joint.axis[None])[2][1:]  # normal to the axis
-                bodies.append((spun, mass, [ring @ across, *(0.0 * ring @ across,) * 2]))
-            if (k := joint.coordinate) is not None:
-                generator = _place(0.0 * np.eye(3), joint.axis)
-                if joint.kind == "revolute":
-                    generator = _place(skew(joint.axis), np.zeros(3))
-                generator[3, 3] = 0.0
-                frame = frame @ expm(_polynomial(*(generator * c[k] for c in series)))
-            moved = [c[part] for c in series]
-            for s, point in enumerate(cloud.ends):
-                B = cloud.outboard[6 * s : 6 * s + 6]
-                u, theta = [B[:3] @ e for e in moved], [skew(B[3:] @ e) for e in moved]
-                u[0] = u[0] + point
-                rates = (_place(0.0 * np.eye(3), x) for x in u[1:])
-                shift = _polynomial(_place(np.eye(3), u[0]), *rates)
-                turn = [np.pad(x, (0, 1)) for x in theta]
-                ends[i, s] = frame @ shift @ expm(_polynomial(*turn))
-            X = [cloud.points + cloud.modes @ moved[0], *(cloud.modes @ e for e in moved[1:])]
-            bodies.append((frame, cloud.masses, X))
-            for (k, s), load in self.carried.items():
-                if k == i:
-                    still = [load.points, *(0.0 * load.points,) * 2]
-                    bodies.append((ends[i, s], load.masses, still))
-            for place, mass, points in bodies:
-                c0, c1, c2 = (place[:4, 4 * j : 4 * j + 4] for j in range(3))
-                R0, R1, R2 = (c[:3, :3] for c in (c0, c1, c2))
-                masses.append(mass)
-                places.append(points[0] @ R0.T + c0[:3, 3])
-                acceleration = points[0] @ R2.T + points[1] @ R1.T + points[2] @ R0.T + c2[:3, 3]
-                second.append(2.0 * acceleration)
-        return np.concatenate(masses), np.concatenate(places), np.concatenate(second)
-
-
-def _ring(inertia: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (4, 2) about an axis and their masses, of a moment of inertia, kg m2."""
-    points = 0.7 * np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
-    return points, np.full(4, inertia / (4 * 0.7**2))
-
-
-def _rigid(points: np.ndarray, masses: np.ndarray) -> Cloud:
-    """Return a rigid body in space without further interfaces."""
-    none = np.zeros((0, 0))
-    modes, outboard = np.zeros((len(points), 3, 0)), np.zeros((6, 0))
-    return Cloud(points, masses, modes, none, none, outboard, np.zeros((1, 3)))
-
-
-def _together(one: Cloud, other: Cloud) -> Cloud:
-    """Return two rigid bodies in one frame as one."""
-    points = np.concatenate([one.points, other.points])
-    return _rigid(points, np.concatenate([one.masses, other.masses]))
-
-
-def _place(R: np.ndarray, origin: np.ndarray) -> np.ndarray:
-    out = np.zeros((4, 4), dtype=np.result_type(R, origin))
-    out[:3, :3], out[:3, 3] = R, origin
-    if R.any():
-        out[3, 3] = 1.0
-    return out
-
-
-def _polynomial(*coefficients: np.ndarray) -> np.ndarray:
-    """Return c_0 + c_1 t + c_2 t^2 as a block Toeplitz matrix (12, 12)."""
-    out = np.zeros((12, 12), dtype=np.result_type(*coefficients))
-    for k, c in enumerate(coefficients):
-        for i in range(3 - k):
-            out[4 * i : 4 * i + 4, 4 * (i + k) : 4 * (i + k) + 4] = c
-    return out
-
-
-def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
+def random_tree(rng: np.random.Generator, interfaces: int = 1) -> PointMachine:
     """Return two branches with every kind of joint, rigid and flexible bodies, and loads."""
     last = interfaces - 1
     rigid, fork = (random_cloud(rng, q, 3, interfaces) for q in (0, 3))
@@ -566,17 +342,14 @@ def random_tree(rng: np.random.Generator, interfaces: int = 1) -> CloudTree:
     )  # fmt: skip
     joints = []
     for kind, parent, coordinate, rotor, *interface in kinds:
-        axis, origin, turn = rng.normal(size=(3, 3))
-        place = (
-            axis / np.linalg.norm(axis),
-            0.3 * origin,
-            Rotation.from_rotvec(turn).as_matrix(),
-            rotor,
-        )
+        axis, origin, turned = rng.normal(size=(3, 3))
+        place = axis / np.linalg.norm(axis), 0.3 * origin, turn(turned), rotor
         joints.append(Joint("joint", kind, parent, coordinate, *place, *interface))
     loads = {site: random_cloud(rng, 0, 3) for site in sorted({(1, 0), (1, last), (3, 0), (4, 0)})}
-    clouds = rigid, fork, *outer, rigid
-    return CloudTree(clouds, tuple(joints), loads, rng.normal(size=3), 4)
+    clouds, gravity = (rigid, fork, *outer, rigid), rng.normal(size=3)
+    bodies, carried = [c.body() for c in clouds], {at: c.body() for at, c in loads.items()}
+    mechanism = spatial_mechanism(bodies, joints, carried, gravity, (4, 0))
+    return PointMachine(mechanism, clouds, tuple(joints), loads, gravity)
 
 
 # -- changes and derivatives -----------------------------------------------------------------

@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 from runs import ROOT, run, tomllib
-from scipy.spatial.transform import Rotation
 
 from dolfinopt.motion.build import build_mechanism, rigid_link
 from dolfinopt.multibody.shape_integrals import rigid_spatial_body
-from dolfinopt.multibody.tree import GROUND, Mechanism
+from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.scene.load import read_scene
 
 DEMO = ROOT / "demos" / "robot.urdf"
@@ -120,25 +119,3 @@ def mechanism_of(file: Path, solids: Mapping[str, Sequence[Any]]) -> Mechanism:
         for arm in scene.arms
     ]  # fmt: skip
     return build_mechanism(scene, bodies)
-
-
-def frames_of(mechanism: Mechanism, q: np.ndarray) -> list[np.ndarray]:
-    """Return the pose (4, 4) of every body's frame in the world at joint coordinates (k,)."""
-    found: dict[int, np.ndarray] = {}
-    for i in mechanism.order:
-        joint = mechanism.joints[i]
-        outer = np.eye(4)
-        if joint.parent != GROUND:
-            outer = found[joint.parent].copy()
-            outer[:3, 3] += outer[:3, :3] @ mechanism.bodies[joint.parent].outboard_point
-        own = np.eye(4)
-        own[:3, :3], own[:3, 3] = joint.rotation, joint.origin
-        moved = np.eye(4)
-        if joint.coordinate is not None:
-            value = q[joint.coordinate]
-            if joint.kind == "prismatic":
-                moved[:3, 3] = value * joint.axis
-            else:
-                moved[:3, :3] = Rotation.from_rotvec(value * joint.axis).as_matrix()
-        found[i] = outer @ own @ moved
-    return [found[i] for i in range(len(found))]

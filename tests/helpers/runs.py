@@ -41,12 +41,6 @@ def scene(*changes: str) -> Scene:
     return do.load_scene(TWO_ARM, changes)
 
 
-def minimising(one: Scene, kind: str) -> Scene:
-    """Return the scene with another objective, which its key's literal need not have."""
-    objective = one.objective.unchecked_copy({"kind": kind})
-    return one.unchecked_copy({"objective": objective})
-
-
 def quick(*changes: str, iterations: int = 0) -> Scene:
     """Return the two-arm scene in few cells, roughly solved."""
     return scene(*QUICK, f"optimizer.max_iterations={iterations}", *changes)

@@ -10,7 +10,6 @@ import pytest
 from dolfinx.fem import locate_dofs_topological
 from mpi4py import MPI
 from runs import refusal
-from scipy.spatial import cKDTree
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
@@ -68,25 +67,6 @@ def radius_error(mesh, facets, x, radius):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_scara_arm_is_tapered_and_its_interfaces_are_its_bores(shape):
-    """No ray of the mesh within a bore's box is an interface, or a ring would be wider there."""
-    taper, bore, passive = 0.75, 0.4, 0.006  # the file's defaults, and its ring here
-    mesh = arm_mesh(COMM, entry(mesh_folder() / "scara_arm.geo", length=0.325, height=0.1,
-                                mesh_size=0.004, cell_shape=shape, passive=passive))  # fmt: skip
-    outer = 0.05, 0.05 * taper
-    for facets, x, radius in zip((mesh.inboard_facets, mesh.outboard_facets), (0.0, 0.325), outer):
-        assert radius_error(mesh, facets, x, bore * radius) < 1e-9
-    # Two sectors and the bar between their tangents, without the bores.
-    lean = np.arcsin((outer[0] - outer[1]) / 0.325)
-    sectors = (0.5 * np.pi - lean) * outer[1] ** 2 + (0.5 * np.pi + lean) * outer[0] ** 2
-    area = sectors + sum(outer) * 0.325 * np.cos(lean) - np.pi * bore**2 * np.square(outer).sum()
-    assert collect(mesh.area).sum() == pytest.approx(area, rel=2e-3)  # arcs in chords
-    solid = collect(mesh.centroid)[collect(mesh.passive)]
-    inboard = np.linalg.norm(solid[solid[:, 0] < 0.16], axis=1)
-    assert inboard.max() < bore * outer[0] + 0.1 / 16.0  # the file's own ring, a little wider
-
-
-@pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize(
     ("passive", "ring"), [(0.012, 0.012), pytest.param(0.0, HEIGHT / 8.0, marks=pytest.mark.serial)]
 )
@@ -104,26 +84,6 @@ def test_bores_are_interfaces_in_solid_rings(shape, passive, ring):
     np.testing.assert_allclose(points.min(axis=0), [-half, -half], atol=1e-9)
     np.testing.assert_allclose(points.max(axis=0), [LENGTH + half, half], atol=1e-9)
     assert np.array_equal(mesh.outboard_point, [LENGTH, 0.0])
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("shape", SHAPES)
-def test_meshes_of_the_arm_with_bores(shape):
-    """Their area converges, polygons in place of circles, by order 2; sizes of cells; symmetry."""
-    exact = LENGTH * HEIGHT + np.pi * (0.25 * HEIGHT**2 - 2.0 * BORE**2)
-    sizes = HEIGHT / np.array([6.0, 12.0, 24.0])
-    meshes = [bores(mesh_size=size, cell_shape=shape) for size in sizes]
-    errors = [abs(COMM.allreduce(mesh.area.sum()) / exact - 1.0) for mesh in meshes]
-    assert errors[-1] < 1e-4  # 4.2e-5
-    assert 1.7 < np.polyfit(np.log(sizes), np.log(errors), 1)[0] < 2.3  # 1.93
-    for size, mesh in zip(sizes, meshes):
-        middle = np.abs(mesh.centroid[:, 0] - 0.5 * LENGTH) < 0.25 * LENGTH
-        typical = np.median(collect(mesh.area[middle])) / (0.5 if shape == "triangle" else 1.0)
-        assert 0.6 < np.sqrt(typical) / size < 1.1  # equilateral triangles: sqrt(0.87)
-    centroid = collect(meshes[0].centroid)
-    distance, pair = cKDTree(centroid).query(centroid * [1.0, -1.0])
-    assert distance.max() < 1e-7 * HEIGHT  # Gmsh places points of curves to 1e-9 of their length
-    assert np.array_equal(pair[pair], np.arange(len(pair)))
 
 
 PLAIN = """
@@ -212,23 +172,6 @@ def test_passive_cells_lie_within_passive_of_an_interface(write):
     assert 0 < COMM.allreduce(int(mesh.passive.sum())) < COMM.allreduce(mesh.num_cells)
 
 
-@pytest.mark.serial  # Gmsh runs on one rank
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("version", [2.2, 4.1])
-def test_mesh_file_holds_what_its_geometry_did(shared_tmp_path, shape, version):
-    def make(gmsh):
-        gmsh.onelab.setNumber("Parameters/1 length (m)", [LENGTH])
-        gmsh.onelab.setNumber("Parameters/3 mesh size (m)", [0.01])
-        gmsh.onelab.setNumber("Parameters/6 cell shape", [float(shape == "quadrilateral")])
-        gmsh.open(BORES)
-        gmsh.model.mesh.generate(2)
-        gmsh.option.setNumber("Mesh.MshFileVersion", version)
-
-    path = gmsh_writes(shared_tmp_path / "arm.msh", make)
-    expected = figures(bores(mesh_size=0.01, cell_shape=shape))
-    np.testing.assert_allclose(figures(arm_mesh(COMM, entry(path))), expected, rtol=1e-12)
-
-
 def plate(occ):
     """Make a rectangle with a bore at each joint axis, that of the inboard one larger by 3 mm."""
     half = 0.5 * HEIGHT
@@ -298,16 +241,6 @@ def test_step_with_bores(shared_tmp_path, z, shape):
     assert radius_error(mesh, mesh.inboard_facets, 0.0, 0.013) < 1e-9
     assert radius_error(mesh, mesh.outboard_facets, LENGTH, BORE) < 1e-9
     assert np.abs(mesh.mesh.geometry.x[:, 2]).max() == 0.0
-
-
-@pytest.mark.serial  # Gmsh runs on one rank
-def test_step_with_straight_ends(shared_tmp_path):
-    path = step_file(shared_tmp_path / "arm.stp", bar=bar_with_straight_ends)
-    mesh = arm_mesh(COMM, entry(path))  # a twelfth of the height
-    assert figures(mesh)[1] == pytest.approx(LENGTH * HEIGHT, rel=1e-9)
-    for facets, x in ((mesh.inboard_facets, 0.0), (mesh.outboard_facets, LENGTH)):
-        low, high = (f(facet_nodes(mesh, facets), axis=0) for f in (np.min, np.max))
-        np.testing.assert_allclose([low, high], [[x, -0.03], [x, 0.03]], atol=1e-9)
 
 
 @pytest.mark.serial  # Gmsh runs on one rank
@@ -648,65 +581,3 @@ def test_gmsh_may_end_its_own_process_alone_and_ctrl_c_ends_it(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         in_child(time.sleep, 600.0)
     assert not multiprocessing.active_children()
-
-
-# -- names in STEP files: a text written out by hand, a square with a hole, in millimetres  -------
-
-
-# As programs write it: spaces and line ends anywhere, comments of a kind in strings.
-SQUARE = """ISO-10303-21;
-DATA;
-#1=CARTESIAN_POINT('a; #2 (b)',(0.,0.,0.)); #2=CARTESIAN_POINT('',(40.,0.,0.));
-#3=CARTESIAN_POINT('',(4.E+01,2.0E1,0.)); #4=CARTESIAN_POINT('',(0,20,0));
-#5=CARTESIAN_POINT('',(1.5E+01,1.E+01,0.)); #6=CARTESIAN_POINT('centre',(10.,10.,0.));
-#11 = VERTEX_POINT ( '', #1 ); #12=VERTEX_POINT('',#2); #13=VERTEX_POINT('',#3);
-#14=VERTEX_POINT('',#4); #15=VERTEX_POINT('',#5);
-#21=EDGE_CURVE('Inboard ',#11,
-  #14,#90,.T.);
-#22=EDGE_CURVE('it''s',#11,#12,#91,.T.); #23=EDGE_CURVE('',#12,#13,#92,.T.);
-#24=EDGE_CURVE('',#13,#14,#93,.T.); #25=EDGE_CURVE('outboard',#15,#15,#94,.T.);
-#31=ORIENTED_EDGE('',*,*,#21,.T.); #32=ORIENTED_EDGE('',*,*,#22,.T.);
-#33=ORIENTED_EDGE('',*,*,#23,.T.); #34=ORIENTED_EDGE('',*,*,#24,.T.);
-#35=ORIENTED_EDGE('',*,*,#25,.F.);
-#41=EDGE_LOOP('',(#31,#32,#33,#34)); #42=EDGE_LOOP('',(#35));
-#51=FACE_OUTER_BOUND('',#41,.T.); #52=FACE_BOUND('',#42,.T.);
-#61=ADVANCED_FACE('passive',(#51,#52),#95,.T.);
-#94=CIRCLE('hole',#96,5.); #96=AXIS2_PLACEMENT_3D('',#6,$,$);
-#97=( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT(.MILLI.,.METRE.) );
-ENDSEC;
-"""
-CORNERS = 1e-3 * np.array([[0, 0, 0], [40, 0, 0], [40, 20, 0], [0, 20, 0]])  # m
-HOLE = 1e-3 * np.array([[15.0, 10.0, 0.0]])  # m
-EVERYWHERE = np.concatenate([CORNERS, HOLE])
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    ("points", "names"),
-    [
-        (CORNERS[[0, 3]], {"inboard"}),
-        (CORNERS[[3, 0]], {"inboard"}),  # the other way round
-        (CORNERS[[3, 0]] + 1e-9, {"inboard"}),
-        (CORNERS[[3, 0]] + 1e-6, set()),
-        (HOLE[[0, 0]], {"outboard"}),  # closed: begins where it ends
-        (CORNERS[[1, 2]], set()),  # bears no name
-        (CORNERS[[0, 2]], set()),  # no edge
-        (CORNERS[[0, 0]], set()),  # one of its ends
-    ],
-)
-def test_edges_are_found_by_their_ends(points, names):
-    edges, _ = read_shapes(SQUARE)
-    assert edges.names_at(points, EVERYWHERE) == names
-
-
-@pytest.mark.serial
-def test_faces_are_found_by_all_their_vertices_in_any_unit():
-    edges, faces = read_shapes(SQUARE)
-    assert faces.names == ["passive"]
-    assert faces.names_at(np.tile(EVERYWHERE, (2, 1)), EVERYWHERE) == {"passive"}
-    assert faces.names_at(CORNERS, EVERYWHERE) == set()
-    for factor in (1e3, 1.0 / 0.0254):
-        assert edges.names_at(CORNERS[[0, 3]] * factor, EVERYWHERE * factor) == {"inboard"}
-    edges, faces = read_shapes("ISO-10303-21;\nDATA;\nENDSEC;\n")
-    assert edges.names == faces.names == []
-    assert edges.names_at(CORNERS, EVERYWHERE) == set()

@@ -1,9 +1,5 @@
 """Links of others: Abaqus and CalculiX files, interfaces by bores wherever the file has them."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import meshio
 import numpy as np
 import pytest
@@ -13,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.abaqus import facets_of, read_abaqus
-from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
+from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.scene.load import Arm
 
@@ -35,7 +31,7 @@ inboard, 1, 3
 """
 
 
-def write_link(path: Path, order: int = 1) -> None:
+def write_link(path, order=1):
     """Write a flat link with two bores, tetrahedra, groups as Gmsh saves them."""
     with gmsh_on_root(COMM) as gmsh:
         model = gmsh.model
@@ -63,7 +59,7 @@ def write_link(path: Path, order: int = 1) -> None:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
+def folder(tmp_path_factory):
     """Return a folder with the link as .msh, .inp, and turned, in mm, of second order."""
     found = tmp_path_factory.mktemp("links")
     write_link(found / "link.msh")
@@ -78,11 +74,11 @@ def folder(tmp_path_factory) -> Path:
     return found
 
 
-def link(folder: Path, name: str, **keys) -> ArmMesh:
+def link(folder, name, **keys):
     return arm_mesh(COMM, Arm(mesh=str(folder / name), cell_shape="tetrahedron", **SIZE | keys))
 
 
-def bore(name: str, x: float, radius: float = RADIUS, sign: float = 1.0) -> dict:
+def bore(name, x, radius=RADIUS, sign=1.0):
     """Return a bore of the turned link."""
     point, axis = TURNED @ [x, 0.0, 0.0] + MOVED, sign * 3.0 * TURNED[:, 2]
     return {"name": name, "point": tuple(point), "axis": tuple(axis), "radius": radius}
@@ -91,7 +87,7 @@ def bore(name: str, x: float, radius: float = RADIUS, sign: float = 1.0) -> dict
 BEGIN, END = bore("inboard", 0.0), bore("outboard", LENGTH)
 
 
-def same(mesh: ArmMesh, other: ArmMesh) -> bool:
+def same(mesh, other):
     """Return whether cells lie at the same places, and interfaces have as many facets."""
     order = [np.lexsort(np.round(one.centroid, 9).T) for one in (mesh, other)]
     apart = mesh.centroid[order[0]] - other.centroid[order[1]]
@@ -99,7 +95,7 @@ def same(mesh: ArmMesh, other: ArmMesh) -> bool:
     return bool(one == two and np.abs(apart).max() < 1e-9)
 
 
-def test_file_of_abaqus_is_that_of_gmsh(folder) -> None:
+def test_file_of_abaqus_is_that_of_gmsh(folder):
     """Sets as interfaces; what a model has besides its mesh does not matter."""
     plain = link(folder, "link.msh")
     assert same(link(folder, "link.inp"), plain)
@@ -108,7 +104,7 @@ def test_file_of_abaqus_is_that_of_gmsh(folder) -> None:
     assert plain.area.sum() == pytest.approx(THICKNESS * area, rel=0.01)
 
 
-def test_link_is_found_by_its_bores_wherever_it_lies(folder) -> None:
+def test_link_is_found_by_its_bores_wherever_it_lies(folder):
     """Turned, in mm, cells of second order and no sets: the same arm to rounding."""
     turned = link(folder, "turned.inp", mesh_scale=1e-3, interfaces=(BEGIN, END))
     assert same(turned, link(folder, "link.msh"))
@@ -124,7 +120,7 @@ def test_link_is_found_by_its_bores_wherever_it_lies(folder) -> None:
     assert same(again, link(folder, "link.msh"))
 
 
-def write_blocks(path: Path, surfaces: bool) -> None:
+def write_blocks(path, surfaces):
     """Write a bar of 6 x 2 x 2 hexahedra by hand, sets of nodes and of cells."""
     nx, n = 6, 2
     x, y, z = np.meshgrid(
@@ -154,7 +150,7 @@ def write_blocks(path: Path, surfaces: bool) -> None:
 
 
 @pytest.mark.parametrize("surfaces", [False, True])
-def test_sets_are_interfaces_and_regions(surfaces, tmp_path) -> None:
+def test_sets_are_interfaces_and_regions(surfaces, tmp_path):
     """Hexahedra of CalculiX; a further interface, cells that stay solid and void."""
     write_blocks(tmp_path / "bar.inp", surfaces)
     mesh = arm_mesh(COMM, Arm(
@@ -186,13 +182,13 @@ def test_sets_are_interfaces_and_regions(surfaces, tmp_path) -> None:
         ("*NODE\n1,0,0,0\n2,1,0,0\n3,0,1,0\n*ELEMENT, TYPE=CPS3\n1,1,2,3\n", ["C3D4", "C3D8"]),
     ],
 )
-def test_files_that_are_no_link(text, words, tmp_path) -> None:
+def test_files_that_are_no_link(text, words, tmp_path):
     (tmp_path / "bar.inp").write_text(text)
     with refused(*words):
         link(tmp_path, "bar.inp")
 
 
-def test_forms_that_programs_write(folder) -> None:
+def test_forms_that_programs_write(folder):
     """Several blocks of nodes, GENERATE, sets of sets, lines and masses beside the cells."""
     lines = (folder / "link.inp").read_text().splitlines()
     first = next(k for k, line in enumerate(lines) if line.upper().startswith("*NODE")) + 1
@@ -211,7 +207,7 @@ def test_forms_that_programs_write(folder) -> None:
     assert len(mesh.node_sets["second"]) == len(nodes) - half
 
 
-def test_nodes_of_an_element_set_and_faces_of_a_surface() -> None:
+def test_nodes_of_an_element_set_and_faces_of_a_surface():
     """`*NSET, ELSET=` takes corners; a surface names sets, elements or nodes."""
     text = (
         "*NODE\n1,0,0,0\n2,1,0,0\n3,0,1,0\n4,0,0,1\n*ELEMENT, TYPE=C3D4, ELSET=E\n"
@@ -223,7 +219,7 @@ def test_nodes_of_an_element_set_and_faces_of_a_surface() -> None:
     assert facets_of(mesh, "s") == [[1, 4, 2], [3, 4, 1]]
 
 
-def test_what_is_missing_is_told(folder) -> None:
+def test_what_is_missing_is_told(folder):
     """Sets of other names, bores of other radii or places, with what the file has."""
     with refused('node set "inboard" is missing', "*NSET, NSET=inboard", "state its bore"):
         link(folder, "turned.inp")
@@ -244,7 +240,7 @@ def test_what_is_missing_is_told(folder) -> None:
          ["the default, without mesh"]),
     ],
 )  # fmt: skip
-def test_keys_that_do_not_fit(folder, keys, words) -> None:
+def test_keys_that_do_not_fit(folder, keys, words):
     told = {"mesh": str(folder / "turned.inp"), "cell_shape": "tetrahedron"} | SIZE | keys
     with pytest.raises(ValueError) as caught:
         Arm(**{key: value for key, value in told.items() if value is not None})

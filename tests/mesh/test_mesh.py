@@ -1,7 +1,5 @@
 """Meshes: the parametric geometry, its groups, facets between cells, boxes and uniform members."""
 
-from __future__ import annotations
-
 import json
 import math
 import subprocess
@@ -33,59 +31,9 @@ COMM = MPI.COMM_WORLD
 # measured here: off by 2e-12 of the curve's length at most.
 PLACING = 1e-10
 
-SHAPES = [  # length m, height m, cells
-    (1.0, 0.06, (20, 4)),
-    (2.5, 0.1, (50, 3)),
-    (0.3, 0.5, (1, 1)),
-    (0.7, 0.2, (1, 7)),
-    (3.0, 0.02, (7, 1)),
-    (10.0, 0.01, (400, 2)),  # a thousand times longer than high
-]
-
 
 def arm(length=1.0, height=0.06, cells=(20, 4), passive=0.0, comm=COMM):
     return box_arm(comm, "arm", (length, height), cells, passive)
-
-
-def collect(values):
-    """Return the owned rows of all ranks."""
-    return np.concatenate(COMM.allgather(values))
-
-
-@pytest.fixture(scope="module", params=SHAPES, ids=str)
-def shaped(request):
-    """Return length, height, cells and the mesh made of them."""
-    return *request.param, arm(*request.param)
-
-
-def test_cells_tile_the_arm(shaped):
-    length, height, cells, mesh = shaped
-    centroid, area = collect(mesh.centroid), collect(mesh.area)
-    assert mesh.num_cells == len(mesh.centroid) == compat.local_cell_counts(mesh.mesh)[0]
-    assert len(area) == cells[0] * cells[1]
-    size = np.array([length / cells[0], height / cells[1]])
-    corner = (centroid - [0.0, -0.5 * height]) / size - 0.5
-    found = set(map(tuple, np.rint(corner).astype(int).tolist()))
-    assert found == {(i, j) for i in range(cells[0]) for j in range(cells[1])}
-    assert np.abs((corner - np.rint(corner)) * size).max() < PLACING * length
-    tolerance = PLACING * (length / size[0] + height / size[1])
-    assert np.abs(area / size.prod() - 1.0).max() < tolerance
-    assert np.array_equal(mesh.outboard_point, [length, 0.0])
-    assert not mesh.passive.any()
-
-
-def test_interfaces_are_the_short_sides(shaped):
-    length, height, cells, mesh = shaped
-    owned = mesh.mesh.topology.index_map(1).size_local
-    for facets, x in ((mesh.inboard_facets, 0.0), (mesh.outboard_facets, length)):
-        assert COMM.allreduce(int((facets < owned).sum())) == cells[1]
-        middle = np.empty((0, 3))
-        if len(facets):
-            middle = dolfinx.mesh.compute_midpoints(mesh.mesh, 1, facets.astype(np.int32))
-        assert np.all(np.abs(middle[:, 0] - x) < PLACING * length)
-        sides = np.sort(collect(middle[facets < owned, 1]))
-        expected = (np.arange(cells[1]) + 0.5) * height / cells[1] - 0.5 * height
-        assert np.abs(sides - expected).max() < PLACING * height
 
 
 # Cells along; the passive length and how many columns of cells it makes at each end, if there are.
@@ -117,17 +65,6 @@ def test_passive_cells_have_their_centre_within_the_passive_length(along, passiv
     if 2.0 * passive < 1.0:  # what a scene admits
         size = {"length": 1.0, "height": 0.06, "thickness": 0.01}
         assert Arm(name="a", **size, cells=(along, 2), passive=passive).passive_columns == columns
-
-
-def test_area_of_distorted_cells():
-    """Against the boundary: twice the area is the sum of x dy - y dx around the polygon."""
-    rng = np.random.default_rng(1)
-    quad = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
-    for corners, around in ((quad, [0, 1, 3, 2]), (quad[:3], [0, 1, 2])):
-        cells = corners + 0.2 * rng.uniform(-1.0, 1.0, (30, len(corners), 2))
-        x, y = cells[:, around, 0], cells[:, around, 1]
-        twice = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1)
-        assert np.allclose(cell_sizes(cells), 0.5 * twice, rtol=1e-14)
 
 
 # In a process of its own: Gmsh keeps parameters as long as the process lives.
@@ -169,7 +106,6 @@ def test_geometry_opens_by_itself(arguments, length, surfaces):
 
 
 BORES = str(mesh_folder() / "arm_bores.geo")
-SHAPED = ["quadrilateral", "triangle"]
 
 
 def solid(size, shape):
@@ -183,24 +119,6 @@ def solid(size, shape):
     squares = np.linalg.eigvals(np.linalg.solve(body.M, body.K)).real
     flexibility = body.outboard @ np.linalg.solve(body.K, body.outboard.T)
     return np.sqrt(squares.min()) / (2.0 * np.pi), flexibility, body
-
-
-@pytest.mark.serial  # ranks: test_ranks of test_elements
-@pytest.mark.parametrize("shape", SHAPED)
-def test_arm_with_bores_is_a_beam_between_them(shape):
-    """u_x, u_y and theta of the outboard bore about its centre; pulling does not bend."""
-    _, flexibility, body = solid(0.005, shape)
-    EI, GA, L = 70e9 * 0.01 * 0.06**3 / 12.0, 70e9 / 2.66 * 0.01 * 0.06, 0.5  # N m2, N, m
-    # A beam with a rotational spring at each bore, whose flexibility the tip's rotation gives.
-    spring = 0.5 * (flexibility[2, 2] - L / EI)
-    assert 0.0 < spring < 0.1 * L / EI  # 0.055
-    assert flexibility[1, 2] == pytest.approx(L**2 / (2.0 * EI) + L * spring, rel=1e-3)  # 2e-4
-    bending = L**3 / (3.0 * EI) + L**2 * spring + L / (GA * 5.0 / 6.0)
-    assert flexibility[1, 1] == pytest.approx(bending, rel=1e-2)  # 2e-3
-    assert flexibility[0, 0] == pytest.approx(L / (70e9 * 0.01 * 0.06), rel=0.2)
-    scale = np.sqrt(np.outer(np.diag(flexibility), np.diag(flexibility)))
-    assert np.abs((flexibility / scale)[0, 1:]).max() < 1e-7  # mirror images to 1e-9 of the curves
-    assert np.array_equal(body.outboard_point, [0.5, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -363,20 +281,11 @@ def test_volumes_of_skew_cells():
     assert np.allclose(np.abs(facet_areas(frustum[None, 4:])), [[0.0, 0.0, 0.25]])
 
 
-@pytest.mark.serial
-def test_facets_of_cells_in_the_order_of_the_reference_cell():
-    mesh = box_arm(COMM, "a", SIZE, CELLS)
-    facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
-    low = mesh.centroid[:, 0] < 0.05
-    assert np.isin(facets[low, 2], mesh.inboard_facets).all()  # opposite to x = 1
-    assert not np.isin(facets[:, [0, 1, 3, 4, 5]], mesh.inboard_facets).any()
-
-
 # Five tetrahedra in a hexahedron whose corners are numbered as a tensor product.
 FIVE = np.array([[0, 1, 2, 4], [3, 1, 2, 7], [5, 1, 4, 7], [6, 2, 4, 7], [1, 2, 4, 7]])
 
 
-def row() -> tuple[np.ndarray, np.ndarray]:
+def row():
     """Return points and cells of three cubes in a row along z."""
     grid = np.stack(np.meshgrid(np.arange(4), [0, 1], [0, 1], indexing="ij"), axis=3)
     return grid.reshape(-1, 3)[:, ::-1].astype(float), np.arange(8) + 4 * np.arange(3)[:, None]
@@ -387,7 +296,7 @@ FAN = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.1, 0.1, 1], [0.1, 0.1, -1], 
 THREE = np.array([[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]])
 
 
-def changed(place: int, *value: float) -> np.ndarray:
+def changed(place, *value):
     points = row()[0]
     points[place] = value
     return points

@@ -17,7 +17,7 @@ CADQUERY = Path(__file__).parent / "programs" / "cadquery_face.step"
 pytestmark = pytest.mark.serial
 
 
-def write_link(path: Path, version: float, binary: bool, quadrilaterals: bool = False) -> None:
+def write_link(path, version, binary, quadrilaterals=False):
     """Let Gmsh write a plate with two bores, its groups as a user names them."""
     gmsh.initialize()
     try:

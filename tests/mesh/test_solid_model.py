@@ -1,25 +1,19 @@
 """Solid and hollow arms from STEP, .geo and .msh files: groups, interfaces by place, refusals."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 from mpi4py import MPI
 from runs import ROOT, refusal, refused
-from solids import HEIGHT, LENGTH, THICKNESS, solid_arm, solid_scene
+from solids import HEIGHT, LENGTH, THICKNESS, solid_arm
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm as Flexible
 from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
+from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import cell_sizes, check_cells, facet_corners
 from dolfinopt.mesh.gmsh_session import gmsh_on_root
-from dolfinopt.mesh.hollow import Member, Wall, box_hull, hull_of, stations, tube_hull
+from dolfinopt.mesh.hollow import Member, Wall, box_hull, tube_hull
 from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
-from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm
 from dolfinopt.scene.tables.joints import Interface
 
@@ -36,17 +30,17 @@ Physical Surface("Outboard") = {{Surface In BoundingBox {{0.499999, -1, -1, 0.50
 """
 
 
-def mesh_of(path: Path, **keys: object) -> ArmMesh:
+def mesh_of(path, **keys):
     told = {"cell_shape": "tetrahedron"} | keys
     return arm_mesh(COMM, Arm(**KEYS | told, mesh=str(path)))
 
 
-def sums(mesh: ArmMesh) -> np.ndarray:
+def sums(mesh):
     """Return volume, solid volume and the areas of both interfaces as the mass they carry."""
     return COMM.allreduce(np.array([mesh.area.sum(), mesh.area[mesh.passive].sum()]))
 
 
-def written(folder: Path, name: str, bored: bool, *more: float) -> Path:
+def written(folder, name, bored, *more):
     """Write the box, or a bar with bores about both joint axes and more, as a file of Gmsh's."""
     path = folder / name
     with gmsh_on_root(COMM) as gmsh:
@@ -77,7 +71,7 @@ def test_geo_with_groups(write):
     assert mesh.dim == 3 and np.array_equal(mesh.outboard_point, [LENGTH, 0.0, 0.0])
 
 
-def facets_at(mesh: ArmMesh, facets: np.ndarray) -> np.ndarray:
+def facets_at(mesh, facets):
     """Return the middles (n, 3) of facets of tetrahedra, of all ranks."""
     corners = compat.cell_coordinates(mesh.mesh, mesh.num_cells)
     middles = corners[:, np.array(facet_corners(3, 4))].mean(axis=2)
@@ -119,21 +113,7 @@ def test_step_without_names(shared_tmp_path, bored):
     assert COMM.allreduce(np.array(ends)).min() >= 8
 
 
-def test_body_of_a_step_file(shared_tmp_path):
-    """Quadratic tetrahedra, from file to floating body: six coordinates, the solid's inertia."""
-    path = written(shared_tmp_path, "bar.step", bored=False)
-    keys = {"cells": None, "mesh": str(path), "mesh_size": 0.015, "cell_shape": "tetrahedron"}
-    scene = solid_scene(**keys, filter_radius=0.02)
-    arm = Flexible(scene, 0, COMM, Profile())
-    body = arm.reduce(arm.physical(np.ones(arm.mesh.num_cells)))
-    mass = 2700.0 * LENGTH * HEIGHT * THICKNESS
-    assert body.mass == pytest.approx(mass, rel=1e-9)
-    assert body.W[0, 0, 0] == pytest.approx(mass * LENGTH**2 / 3.0, rel=1e-9)
-    bending = 3.0 * 70e9 * THICKNESS * HEIGHT**3 / 12.0 / LENGTH**3
-    assert np.linalg.inv(body.K)[1, 1] * bending == pytest.approx(1.0, abs=0.02)
-
-
-def row_of_cubes(path: Path) -> Path:
+def row_of_cubes(path):
     """Write one layer of hexahedra along the arm as Gmsh's file."""
     places = [(x, y, z) for x in np.linspace(0.0, LENGTH, 3) for y in (-0.5, 0.5)
               for z in (-0.5, 0.5)]  # fmt: skip
@@ -213,19 +193,6 @@ def test_the_wall_has_the_volume_of_its_section(hull, area):
     assert len(mesh.inboard) == len(mesh.outboard) == hull.shape[1]
 
 
-def test_the_wall_of_a_cone_is_as_thick_as_it_says():
-    """Between two cones of half angle a and distance t along the normal; to (pi / r)^2 / 6."""
-    around, slope, t = 120, 0.4, 0.002
-    x, turns = stations(0.5, 8), 2.0 * np.pi * np.arange(around) / around
-    radius = 0.3 - slope * x
-    outer = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    points = np.empty((len(x), around, 3))
-    points[:, :, 0], points[:, :, 1:] = x[:, None], radius[:, None, None] * outer
-    inner = hull_of(points).points(t).reshape(2, len(x), around, 3)[1]
-    found = (radius[:, None] - np.hypot(*inner[:, :, 1:].transpose(2, 0, 1))) / np.hypot(1.0, slope)
-    assert found == pytest.approx(np.full_like(found, t), rel=1e-3)
-
-
 def test_thickness_follows_the_cells_and_gradients_go_back():
     """t is linear in x: backward is its transpose, and a uniform x is a uniform wall."""
     rng = np.random.default_rng(2)
@@ -302,7 +269,7 @@ def test_what_a_hollow_arm_cannot_have(changes, words):
         do.load_scene(ROOT / "demos" / "two_arm.toml", ("arms.hollow=true", "arms.wall=0.002"))
 
 
-def taper() -> Member:
+def taper():
     """Return a solid whose section shrinks along it from 60 x 40 mm to half of both."""
     counts = np.array([7, 5, 5])
     grid = np.indices(counts).reshape(3, -1).T / (counts - 1.0)
@@ -318,7 +285,7 @@ def taper() -> Member:
     return Member(points, hexahedra, first[:, ::-1], last)
 
 
-def hull_arm(tmp_path, mesh: Member, **keys):
+def hull_arm(tmp_path, mesh, **keys):
     """Return the arm whose hull is a mesh's."""
     path = tmp_path / "hull.msh"
     path.write_bytes(msh_bytes(mesh))

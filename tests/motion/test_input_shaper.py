@@ -8,7 +8,7 @@ from dolfinopt.motion.input_shaper import EI_VIBRATION, input_shaper
 FREQUENCY, DAMPING = 40.0, 0.05  # rad/s, -
 
 
-def left(kind: str, ratio: float = 1.0, damping: float = DAMPING) -> float:
+def left(kind, ratio=1.0, damping=DAMPING):
     """Return what an oscillator at ratio times the frequency keeps of an unshaped step's vibration.
 
     Its phasor just after the last part of the step, over that of a whole step at that instant.
@@ -21,24 +21,24 @@ def left(kind: str, ratio: float = 1.0, damping: float = DAMPING) -> float:
 
 
 @pytest.mark.parametrize("kind", ["zv", "zvd"])
-def test_nothing_vibrates_at_the_frequency(kind) -> None:
+def test_nothing_vibrates_at_the_frequency(kind):
     assert left(kind) < 1e-12
 
 
-def test_zvd_is_flat_and_zv_is_not() -> None:
+def test_zvd_is_flat_and_zv_is_not():
     """Off the frequency ZV leaves in proportion, ZVD the square."""
     near, far = (np.array([left(kind, 1.0 + x) for kind in ("zv", "zvd")]) for x in (0.01, 0.02))
     assert np.log2(far / near) == pytest.approx([1.0, 2.0], abs=0.05)
 
 
-def test_ei_leaves_its_share_and_has_a_wide_band() -> None:
+def test_ei_leaves_its_share_and_has_a_wide_band():
     assert left("ei", damping=0.0) == pytest.approx(EI_VIBRATION)
     band = [left("ei", 1.0 + x, damping=0.0) for x in np.linspace(-0.19, 0.19, 39)]
     assert max(band) < 1.05 * EI_VIBRATION  # ZVD: 0.087
     assert left("zvd", 1.19, damping=0.0) > 1.5 * EI_VIBRATION
 
 
-def test_a_shaped_command_begins_and_ends_with_the_command() -> None:
+def test_a_shaped_command_begins_and_ends_with_the_command():
     shaper, t = input_shaper("zvd", FREQUENCY, DAMPING), np.linspace(0.0, 2.0, 41)
     found = shaper.shaped(lambda t: np.stack([np.minimum(t, 1.0), np.cos(t)], axis=1), t)
     assert shaper.amplitudes.sum() == pytest.approx(1.0)

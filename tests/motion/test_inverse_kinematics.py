@@ -1,7 +1,5 @@
 """Inverse kinematics in space: closed form, a six-axis robot, joints from the table, refusals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -124,25 +122,6 @@ def test_six_axes(kind, tmp_path):
     assert np.abs(R - target.turning[0]).max() < EXACT
     assert np.abs(differences(scene, between, "q") - motion.qd).max() < 1e-8
     assert np.abs(differences(scene, between, "qd") - motion.qdd).max() < 1e-7
-
-
-def test_turn_on_the_spot(tmp_path):
-    """From stop to stop by a law with limits, which are of the speed along the path: not here."""
-    place, R = end_of(read_scene(ROBOT), JOINTS[None])
-    start = Rotation.from_matrix(R)
-    turned = Rotation.from_rotvec([0.0, 0.0, 0.4]) * start
-    rows = np.vstack([start.as_rotvec(), turned.as_rotvec()])
-    table = "t,x,y,z,rx,ry,rz", [0.0, 0.5], np.vstack([place] * 2), rows
-    file = write(tmp_path / "turn.csv", *table)
-    law = "motion.law=s-curve", "motion.max_speed=0.5", "motion.max_jerk=50.0"
-    guess = f"motion.initial_joints={JOINTS.tolist()}"
-    scene = scene_of(ROBOT, f"motion.file={file}", guess, "motion.horizon=0.5", *law)
-    t = np.linspace(0.0, 0.5, 6)
-    found, turned = end_of(scene, rigid_motion(t, scene).q)
-    assert np.abs(found - place).max() < EXACT
-    back = Rotation.from_matrix(turned) * start.inv()
-    assert np.abs(back.as_rotvec()[:, :2]).max() < EXACT
-    assert back.as_rotvec()[-1, 2] == pytest.approx(0.4, abs=EXACT)
 
 
 def test_joints_of_the_table(tmp_path):

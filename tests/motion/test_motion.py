@@ -3,27 +3,20 @@
 At the end scenes with one and three arms, from the motion to the gradient.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from bodies import assert_close, derivative
 from runs import refused
-from scipy.optimize import brentq
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, forced_rest, rigid_motion
 from dolfinopt.motion.measured import TABLE_CORNERS_LIMIT
-from dolfinopt.motion.plane import Bend
-from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.scene.laws import Limits, law_for
-from dolfinopt.scene.load import Scene, scene_from_dict
+from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
@@ -49,11 +42,11 @@ SCENES = pytest.mark.parametrize(
 
 
 def scene(
-    lengths: tuple[float, ...] = (1.0, 1.0),
-    tables: dict[str, Any] | None = None,
-    cells: tuple[int, int] = (20, 2),
-    **motion: Any,
-) -> Scene:
+    lengths=(1.0, 1.0),
+    tables=None,
+    cells=(20, 2),
+    **motion,
+):
     """Return the paper's example with these arms, this motion and other tables of the scene."""
     section = {"height": 0.06, "thickness": 0.01, "cells": list(cells), "passive": 0.0}
     return scene_from_dict(
@@ -70,7 +63,7 @@ def scene(
     )
 
 
-def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
+def end_points(motion, of):
     """Return the rigid chain's end-effector (n, 2)."""
     lengths = np.array([arm.length for arm in of.arms])
     angles = np.cumsum(motion.q[:, 1:], axis=1)
@@ -79,7 +72,7 @@ def end_points(motion: RigidMotion, of: Scene) -> np.ndarray:
 
 
 @pytest.mark.parametrize("flattening", [0.0, 0.3, 1.0])
-def test_arc_runs_from_left_over_the_top_to_right(flattening: float) -> None:
+def test_arc_runs_from_left_over_the_top_to_right(flattening):
     """On the ellipse, monotone in x, a straight line when it is flattened altogether."""
     of = scene(radius=0.9, flattening=flattening)
     path = desired_path(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), of)
@@ -96,7 +89,7 @@ def test_arc_runs_from_left_over_the_top_to_right(flattening: float) -> None:
         assert_close(by, path[k + 1], DIFFERENCES)
 
 
-def assert_rates(of: Scene, t: np.ndarray) -> None:
+def assert_rates(of, t):
     """Assert that rates are the coordinates' derivatives at t, by differences."""
     here = rigid_motion(t, of)
     for key, rate in (("q", here.qd), ("qd", here.qdd)):
@@ -105,7 +98,7 @@ def assert_rates(of: Scene, t: np.ndarray) -> None:
 
 
 @SCENES
-def test_two_arms_trace_the_arc(keys: dict[str, Any]) -> None:
+def test_two_arms_trace_the_arc(keys):
     """With the elbow on the side asked for and the cart where it should be; then all is at rest."""
     of = scene(**keys)
     motion, path = rigid_motion(DENSE, of), desired_path(DENSE, of)
@@ -119,18 +112,6 @@ def test_two_arms_trace_the_arc(keys: dict[str, Any]) -> None:
     rest = DENSE >= DURATION
     assert not motion.qd[rest].any() and not motion.qdd[rest].any()
     assert_close(motion.q[rest], np.broadcast_to(motion.q[-1], motion.q[rest].shape), 1e-15)
-
-
-@pytest.mark.parametrize("law", ["quintic", "septic"])
-def test_line_is_straight(law: str) -> None:
-    """From start to end, by the law, all derivatives along it."""
-    of = scene(path="line", start=[-0.4, 0.1], end=[0.8, 0.6], law=law)
-    path = desired_path(np.array([0.0, DURATION / 2.0, DURATION, 3.0]), of)
-    assert_close(path[0], [[-0.4, 0.1], [0.2, 0.35], [0.8, 0.6], [0.8, 0.6]], 1e-15)
-    p, pd, pdd = desired_path(INSIDE, of)
-    s = law_for(law, 1.0, Limits(), 0.25)(INSIDE, DURATION)
-    for found, expected in zip((p - [-0.4, 0.1], pd, pdd), s, strict=True):
-        assert_close(found, np.outer(expected, [1.2, 0.5]), 1e-15)
 
 
 LENGTHS = {1: (1.0,), 2: (1.1, 0.9), 3: (0.8, 0.7, 0.5), 4: (0.6, 0.5, 0.5, 0.4)}  # m
@@ -156,13 +137,13 @@ MOTIONS = [
 ]
 
 
-def joint_rows(columns: int) -> np.ndarray:
+def joint_rows(columns):
     """Return joint coordinates at `TIMES` (n, columns)."""
     k = np.arange(columns)
     return 0.4 * np.sin(TIMES[:, None] * (1.0 + 0.7 * k) + k) + 0.2 * k
 
 
-def table_text(path: str, arms: int, base: str) -> str:
+def table_text(path, arms, base):
     """Return a table of points or joints, with times where the path's name says so."""
     names, rows = ["x", "y"], POINTS
     if path.startswith("joints"):
@@ -173,7 +154,7 @@ def table_text(path: str, arms: int, base: str) -> str:
     return "\n".join([",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())])
 
 
-def of_kind(folder: Path, arms: int, path: str, law: str, base: str, **keys: Any) -> Scene:
+def of_kind(folder, arms, path, law, base, **keys):
     """Return one of `MOTIONS`, with its table in `folder`."""
     motion = {**PATHS[path], **BASES[base], "law": law, **keys}
     if motion["path"] in ("points", "joints"):
@@ -183,7 +164,7 @@ def of_kind(folder: Path, arms: int, path: str, law: str, base: str, **keys: Any
 
 
 @pytest.mark.parametrize(("arms", "path", "law", "base"), MOTIONS)
-def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str) -> None:
+def test_every_motion(tmp_path, arms, path, law, base):
     """Traces the path or the rows; rates by differences; continuous, at rest at both ends."""
     of = of_kind(tmp_path, arms, path, law, base)
     check_motion(of)
@@ -211,43 +192,6 @@ def test_every_motion(tmp_path: Path, arms: int, path: str, law: str, base: str)
     assert np.abs(ends.qd).max() < 1e-10 * size
     assert_close(ends.q[:2], ends.q[[0, 0]], 1e-12)
     assert_close(ends.q[3:], ends.q[[2, 2]], 1e-12)
-
-
-@pytest.mark.parametrize("arms", [2, 3, 4, 7])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_bend_is_the_first_from_stretched(arms: int, seed: int) -> None:
-    """By brackets on the chain's own distance: monotone to the least one, and its inverse."""
-    lengths = tuple(np.random.default_rng(seed).uniform(0.2, 1.0, size=arms))
-    bend = Bend(lengths)
-
-    def distance(beta: float) -> float:
-        return float(abs(sum(a * np.exp(1j * k * beta) for k, a in enumerate(lengths))))
-
-    last = np.arccos(bend.least)
-    grid = np.linspace(0.0, last, 400)
-    chain = np.array([distance(beta) for beta in grid])
-    assert (np.diff(chain) < 1e-12).all()
-    if last < np.pi:
-        # Behind the first minimum it rises; 1e-3 rad from it by some 1e-6 of a length.
-        assert distance(last + 1e-3) > distance(last)
-    assert_close(bend.reach, [distance(last), sum(lengths)], 1e-12)
-    wanted = np.linspace(bend.reach[0], bend.reach[1], 23)[1:-1]
-    found = bend.angle(wanted)
-    exact = [brentq(lambda b, d=d: distance(b) - d, 0.0, last, xtol=1e-15) for d in wanted]
-    assert_close(found, exact, 1e-13)  # the distance to rounding over its slope, 0.01 or so
-
-
-@pytest.mark.parametrize("arms", [2, 3])
-def test_angles_do_not_depend_on_the_instants_asked_for(arms: int) -> None:
-    """Alone, backwards and far apart: the shoulder's angle passes pi and goes on."""
-    keys = {"joint_height": 0.3, "cart_follow": 0.0}
-    of = scene({2: (1.0, 1.0), 3: (0.8, 0.8, 0.8)}[arms], **keys)
-    whole = rigid_motion(DENSE, of).q
-    assert np.ptp(np.floor((whole[:, 1] + np.pi) / (2.0 * np.pi))) == 1.0  # it passes
-    assert np.array_equal(rigid_motion(DENSE[::-1], of).q[::-1], whole)
-    alone = [rigid_motion(DENSE[k : k + 1], of).q[0] for k in range(0, len(DENSE), 40)]
-    assert np.array_equal(alone, whole[::40])
-    assert rigid_motion(np.empty(0), of).q.shape == (0, 1 + arms)
 
 
 LINE = {
@@ -280,7 +224,7 @@ UNREACHABLE = [  # arms, motion, worst instant and distance there, what it is, k
 
 
 @pytest.mark.parametrize(("lengths", "keys", "time", "distance", "words", "key"), UNREACHABLE)
-def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key) -> None:
+def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key):
     """In one line the worst instant, the distance there, and the keys that help."""
     with pytest.raises(InputError) as caught:
         check_motion(scene(lengths, **keys))
@@ -291,28 +235,7 @@ def test_reach_of_any_number_of_arms(lengths, keys, time, distance, words, key) 
     assert float(found[2]) == pytest.approx(distance, rel=1e-3, abs=5e-6)
 
 
-@pytest.mark.parametrize("law", ["quintic", "septic", "trapezoidal", "s-curve"])
-def test_points_of_a_straight_line_are_the_line(tmp_path: Path, law: str) -> None:
-    """Whatever their distances; without times the law of the scene holds until the last instant.
-
-    There a trapezoidal speed still brakes; a jump within a step would cost the integrator many.
-    """
-    shares = np.array([0.0, 0.13, 0.2, 0.71, 1.0])
-    rows = np.array([-0.7, -0.1]) + np.outer(shares, [1.3, 0.5])
-    file = tmp_path / "line.csv"
-    file.write_text("\n".join(["x,y", *(f"{x!r},{y!r}" for x, y in rows.tolist())]))
-    straight_path, points = (
-        scene(law=law, **keys) for keys in (PATHS["line"], {"path": "points", "file": str(file)})
-    )
-    t = np.union1d(DENSE, breakpoints(straight_path))
-    straight, found = (rigid_motion(t, of) for of in (straight_path, points))
-    assert_close(found.q, straight.q, 1e-13)
-    assert_close(found.qdd, straight.qdd, 1e-12)
-    last = rigid_motion(np.array([DURATION]), points).qdd
-    assert (np.abs(last).max() > 0.1) == (law == "trapezoidal")
-
-
-def test_breakpoints(tmp_path: Path) -> None:
+def test_breakpoints(tmp_path):
     """The end of the path, and the rows of a short table without times."""
     assert breakpoints(scene()) == (0.0, DURATION, 3.0)
     assert breakpoints(scene(horizon=DURATION)) == (0.0, DURATION)
@@ -331,7 +254,7 @@ def test_breakpoints(tmp_path: Path) -> None:
     assert breakpoints(scene(path="points", file=str(file))) == (0.0, DURATION, 3.0)
 
 
-def test_changed_table_is_read_anew(tmp_path: Path) -> None:
+def test_changed_table_is_read_anew(tmp_path):
     """The curve is kept, but not longer than the file."""
     file = tmp_path / "points.csv"
     file.write_text("x,y\n-0.5,0\n0.5,0\n")
@@ -359,7 +282,7 @@ def test_changed_table_is_read_anew(tmp_path: Path) -> None:
     ],
     ids=["duration", "law", "no cart", "cart"],
 )  # fmt: skip
-def test_table_that_does_not_suit_the_scene(tmp_path, text, keys, words) -> None:
+def test_table_that_does_not_suit_the_scene(tmp_path, text, keys, words):
     """One line that says what to set."""
     file = tmp_path / "joints.csv"
     file.write_text(text)
@@ -370,7 +293,7 @@ def test_table_that_does_not_suit_the_scene(tmp_path, text, keys, words) -> None
 
 
 @pytest.mark.parametrize("name", ["t", "cart"])
-def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
+def test_arm_with_the_name_of_another_column(tmp_path, name):
     """Its column would have two meanings."""
     file = tmp_path / "joints.csv"
     file.write_text("t,cart,arm1\n0,0,0\n1,1,1\n")
@@ -381,7 +304,7 @@ def test_arm_with_the_name_of_another_column(tmp_path: Path, name: str) -> None:
         check_motion(of.unchecked_copy({"arms": arms}))
 
 
-def sampled(folder: Path, count: int = 200, **keys: Any) -> Scene:
+def sampled(folder, count=200, **keys):
     """Return joints that swing as 0.6 sin(2 t), a recording from the midst of the motion."""
     t = np.linspace(0.0, 0.5, count)
     rows = np.column_stack([t, 0.3 * t, 0.6 * np.sin(2.0 * t), 0.5 * np.cos(2.0 * t)])
@@ -393,7 +316,7 @@ def sampled(folder: Path, count: int = 200, **keys: Any) -> Scene:
 
 
 @pytest.mark.parametrize("count", [4, 6, 200])
-def test_a_table_may_move_at_its_ends(tmp_path: Path, count: int) -> None:
+def test_a_table_may_move_at_its_ends(tmp_path, count):
     """At its own rates there, and no rest is forced upon it; its horizon is its own."""
     of = sampled(tmp_path, count, table_ends="moving")
     assert of.motion.horizon == of.motion.duration == 0.5
@@ -405,7 +328,7 @@ def test_a_table_may_move_at_its_ends(tmp_path: Path, count: int) -> None:
     assert forced_rest(of) is None
 
 
-def test_a_forced_rest_is_told(tmp_path: Path) -> None:
+def test_a_forced_rest_is_told(tmp_path):
     """With the acceleration that it needs, that of the rows, and the key that takes their rates."""
     of = sampled(tmp_path)
     motion = rigid_motion(np.linspace(0.0, 0.5, 4001), of)

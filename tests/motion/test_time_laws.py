@@ -1,42 +1,35 @@
 """Time laws against closed forms, differences and their limits; tables with stops."""
 
-from __future__ import annotations
-
-from itertools import pairwise
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
-from bodies import assert_close, derivative
+from bodies import assert_close
 from runs import TWO_ARM, refusal
 
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
-from dolfinopt.motion.paths import Curve, curve_by_chord, curve_in_time
+from dolfinopt.motion.paths import curve_by_chord, curve_in_time
 from dolfinopt.scene.csv_table import Table, read_table
-from dolfinopt.scene.laws import Law, Limits, ShapedLaw, law_for
-from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
+from dolfinopt.scene.laws import Limits, ShapedLaw, law_for
+from dolfinopt.scene.load import read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
 LAWS = ["quintic", "septic", "trapezoidal", "s-curve"]
 EVERY = pytest.mark.parametrize("name", LAWS)
-SMOOTH = {"quintic": 2, "septic": 3, "trapezoidal": 1, "s-curve": 2}  # continuous derivatives
 
 
-def law_of(name: str, share: float = 0.25, length: float = 1.0, **limits: float) -> Law:
+def law_of(name, share=0.25, length=1.0, **limits):
     """Return the law on a path of that length, m."""
     return law_for(name, length, Limits(**limits), share)
 
 
-def pieces(law: Law, duration: float) -> np.ndarray:
+def pieces(law, duration):
     """Return the ends of the law's smooth pieces, s."""
     return np.array([0.0, *(law.knots * duration), duration])
 
 
-def peaks(law: Law, duration: float, length: float) -> np.ndarray:
+def peaks(law, duration, length):
     """Return the largest speed, acceleration and jerk, the latter from cubics through samples."""
     largest = np.zeros(3)
     for a, b in np.stack([pieces(law, duration)[:-1], pieces(law, duration)[1:]], axis=1):
@@ -51,54 +44,7 @@ def peaks(law: Law, duration: float, length: float) -> np.ndarray:
     return length * largest
 
 
-@EVERY
-@pytest.mark.parametrize("share", [0.05, 0.25, 0.5])
-def test_speed_is_the_rate_and_its_area_the_distance(name: str, share: float) -> None:
-    """By Gauss' rule between the knots, exact there; acceleration likewise to the speed."""
-    law, duration = law_of(name, share), 1.7
-    ends = pieces(law, duration)
-    nodes, weights = np.polynomial.legendre.leggauss(5)
-    for order in (1, 2):
-        before = law(np.zeros(1), duration)[order - 1]
-        for a, b in pairwise(ends):
-            t = 0.5 * (a + b) + 0.5 * (b - a) * nodes
-            gained = 0.5 * (b - a) * weights @ law(t, duration)[order]
-            after = law(np.array([b]), duration)[order - 1]
-            assert_close(after - before, [gained], 1e-13, 10.0)
-            before = after
-        assert_close(before, [2.0 - order], 1e-13, 1.0)
-
-
-@EVERY
-def test_law_rests_at_both_ends(name: str) -> None:
-    """Exactly: place and speed at the ends, all before and behind."""
-    law, duration = law_of(name), 0.7
-    s, sd, sdd = law(np.array([-1.0, 0.0, duration, duration * (1 + 1e-9), 2.0]), duration)
-    assert s.tolist() == [0.0, 0.0, 1.0, 1.0, 1.0]
-    assert not sd.any()
-    assert not sdd[[0, 1, 3, 4]].any()
-    if name != "trapezoidal":
-        assert not sdd.any()
-
-
-@EVERY
-@pytest.mark.parametrize("share", [0.1, 0.25, 0.5])
-def test_continuity_is_what_the_law_promises(name: str, share: float) -> None:
-    """Up to that derivative both sides of a knot agree; the next one jumps at some knot."""
-    law, duration = law_of(name, share), 1.0
-    tiny = 1e-7
-    knots = np.concatenate([[0.0], law.knots, [1.0]])
-    both = [law(knots + side * tiny, duration) for side in (-1.0, 1.0)]
-    jumps = [np.abs(a - b).max() for a, b in zip(*both, strict=True)]
-    for order in range(min(SMOOTH[name], 2) + 1):
-        assert jumps[order] <= 1e-3
-    if SMOOTH[name] == 1:
-        assert jumps[2] > 1.0
-        left = law(knots[1:], duration)[2]  # at a knot itself: the value before it
-        assert_close(left, both[0][2][1:], 1e-12)
-
-
-def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives() -> None:
+def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives():
     """(4 u (1 - u))^3 leaves place, speed and acceleration at the ends; by Gauss' rule."""
     law, duration = ShapedLaw(law_of("quintic"), (0.1, -0.2, 0.15)), 0.7
     ends = law(np.array([0.0, duration]), duration)
@@ -115,7 +61,7 @@ def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives() -> No
     assert abs(law(np.array([0.2]), duration)[0] - law.base(np.array([0.2]), duration)[0]) > 0.01
 
 
-def test_peaks_in_closed_form() -> None:
+def test_peaks_in_closed_form():
     """Largest speed and acceleration of a move of 1 m in 1 s."""
     for name, speed, acceleration in (
         ("quintic", 15 / 8, 10 / np.sqrt(3)), ("septic", 35 / 16, 84 * np.sqrt(5) / 25),
@@ -128,7 +74,7 @@ def test_peaks_in_closed_form() -> None:
 
 
 @EVERY
-def test_limits_are_met_exactly(name: str) -> None:
+def test_limits_are_met_exactly(name):
     """At the least duration one of them is reached and none exceeded, whichever binds."""
     rng = np.random.default_rng(5)
     binding = set()
@@ -153,32 +99,13 @@ def test_limits_are_met_exactly(name: str) -> None:
     assert len(binding) == (2 if name == "trapezoidal" else 3)
 
 
-@pytest.mark.parametrize(
-    ("name", "limits", "expected"),
-    [
-        ("trapezoidal", {"speed": 1.0, "acceleration": 2.0}, 2.0 + 0.5),  # D/v + v/a
-        ("trapezoidal", {"speed": 9.0, "acceleration": 2.0}, 2.0),  # 2 sqrt(D/a)
-        ("trapezoidal", {"acceleration": 2.0}, 2.0),
-        ("trapezoidal", {"speed": 1.0}, 2.0 / 0.75),  # D/(v (1 - share))
-        # D/v + v/a + a/j, D/v + 2 sqrt(v/j), cbrt(32 D/j): Biagiotti & Melchiorri 2008, 3.4.
-        ("s-curve", {"speed": 1.0, "acceleration": 2.0, "jerk": 8.0}, 2.0 + 0.5 + 0.25),
-        ("s-curve", {"speed": 1.0, "acceleration": 99.0, "jerk": 4.0}, 2.0 + 1.0),
-        ("s-curve", {"jerk": 32.0}, (32.0 * 2.0 / 32.0) ** (1 / 3)),
-        ("s-curve", {"acceleration": 4.0, "jerk": 16.0}, 0.25 + np.sqrt(0.25**2 + 2.0)),
-    ],
-)
-def test_fastest(name: str, limits: dict[str, float], expected: float) -> None:
-    """Two metres, in closed form."""
-    assert_close(law_of(name, 0.25, 2.0, **limits).least, expected, 1e-14)
-
-
-def posed(**motion: Any) -> Scene:
+def posed(**motion):
     """Return the example with another motion."""
     data = read_scene(TWO_ARM, ("arms.cells=[20,2]",)).to_dict()
     return scene_from_dict(data | {"motion": {"path": "arc"} | motion}, "test.toml")
 
 
-def test_duration_follows_from_the_limits() -> None:
+def test_duration_follows_from_the_limits():
     """Unless stated; values that follow stay free in changes, and a short one is refused."""
     limits = {"law": "trapezoidal", "max_speed": 2.0, "max_acceleration": 5.0}
     of = posed(**limits)
@@ -208,7 +135,7 @@ def test_duration_follows_from_the_limits() -> None:
          ["max_speed", 'none with path = "joints"']),
     ],
 )  # fmt: skip
-def test_values_that_do_not_go_together(motion: dict[str, Any], words: list[str]) -> None:
+def test_values_that_do_not_go_together(motion, words):
     refusal(lambda: posed(**motion), "test.toml", *words)
 
 
@@ -216,7 +143,7 @@ DWELL = "t,x,y\n0,-0.4,0.1\n0.18,0.3,0.2\n0.22,0.3,0.2\n0.4,0.5,0.6\n"
 
 
 @EVERY
-def test_equal_rows_are_a_stop(tmp_path: Path, name: str) -> None:
+def test_equal_rows_are_a_stop(tmp_path, name):
     """At the point to rounding, without speed and acceleration; rest to rest on both sides."""
     file = tmp_path / "pick.csv"
     file.write_text(DWELL)
@@ -242,28 +169,7 @@ def test_equal_rows_are_a_stop(tmp_path: Path, name: str) -> None:
     check_motion(of)
 
 
-def test_joints_stop_and_moves_between_stops_may_have_rows(tmp_path: Path) -> None:
-    """A spline of degree 5 between stops; a stop at the start and at the end, too."""
-    file = tmp_path / "joints.csv"
-    rows = ["0,0,1.5,-1", "0.1,0,1.5,-1", "0.4,0.1,1.2,-1.2", "0.6,0.2,1,-1.1", "0.8,0.2,1,-1.1"]
-    file.write_text("\n".join(["t,cart,arm1,arm2", *rows]))
-    of = posed(path="joints", file=str(file))
-    assert of.motion.duration == 0.8
-    t = np.concatenate([np.linspace(0.0, 0.1, 30), np.linspace(0.6, 0.9, 30)])
-    rest = rigid_motion(t, of)
-    assert not rest.qd.any()
-    assert not rest.qdd.any()
-    assert_close(rest.q[:30], np.tile([0.0, 1.5, -1.0], (30, 1)), 0.0)
-    assert_close(rest.q[30:], np.tile([0.2, 1.0, -1.1], (30, 1)), 0.0)
-    h = 1e-4
-    at = np.array([0.1, 0.25, 0.4, 0.5, 0.6])
-    before, here, after = (rigid_motion(at + k * h, of) for k in (-1, 0, 1))
-    assert_close((after.q - before.q) / (2 * h), here.qd, 1e-5, 1.0)
-    assert_close((after.qd - before.qd) / (2 * h), here.qdd, 2e-3, 10.0)
-    assert_close(rigid_motion(np.array([0.4]), of).q, [[0.1, 1.2, -1.2]], 1e-14)
-
-
-def test_limits_in_a_table_with_stops(tmp_path: Path) -> None:
+def test_limits_in_a_table_with_stops(tmp_path):
     """Each move has the time that the table gives it: too little is named by file and line."""
     file = tmp_path / "pick.csv"
     file.write_text(DWELL)
@@ -281,19 +187,19 @@ ROWS = np.array([[0.0, 0.0], [0.3, 0.4], [1.1, 0.3], [1.0, -0.2], [1.6, -0.3]])
 TIMES = np.array([0.0, 0.3, 0.8, 1.1, 1.9])  # s
 
 
-def written(folder: Path, text: str) -> str:
+def written(folder, text):
     """Return the path of a table with this content."""
     path = folder / "table.csv"
     path.write_text(text, encoding="utf-8")
     return str(path)
 
 
-def table(t: np.ndarray | None = None, rows: np.ndarray = ROWS) -> Table:
+def table(t=None, rows=ROWS):
     """Return a table that was not read from a file."""
     return Table("table.csv", tuple(range(2, 2 + len(rows))), t, rows)
 
 
-def test_columns_in_any_order_comments_blank_lines_and_spreadsheets(tmp_path: Path) -> None:
+def test_columns_in_any_order_comments_blank_lines_and_spreadsheets(tmp_path):
     """Values are those of the columns asked for; lines are those of the file."""
     text = '\ufeff# a path\n\n"y", t ,x\r\n  # from here\n2, 0, 1\n\n-4e-1,.5,3\n'
     found = read_table(written(tmp_path, text), ("x", "y"))
@@ -305,7 +211,7 @@ def test_columns_in_any_order_comments_blank_lines_and_spreadsheets(tmp_path: Pa
 
 
 @pytest.mark.parametrize("separator", [";", "\t", " ; "])
-def test_decimal_commas(tmp_path: Path, separator: str) -> None:
+def test_decimal_commas(tmp_path, separator):
     """As spreadsheets write tables where numbers have commas; points are read, too."""
     text = "t|x|y\n0|1,5|2\n0,5|-4.25|1e-1\n".replace("|", separator)
     found = read_table(written(tmp_path, text), ("x", "y"))
@@ -337,14 +243,14 @@ def test_decimal_commas(tmp_path: Path, separator: str) -> None:
         (b"x,y\n# L\xe4nge\n", ["line 2", "UTF-8"]),
     ],
 )
-def test_bad_table(tmp_path: Path, text: str | bytes, words: list[str]) -> None:
+def test_bad_table(tmp_path, text, words):
     """One line that names the file, the line, the column and the value."""
     file = tmp_path / "table.csv"
     file.write_bytes(text if isinstance(text, bytes) else text.encode())
     refusal(lambda: read_table(str(file), ("x", "y")), f"{file}: ", *words)
 
 
-def test_file_that_cannot_be_read(tmp_path: Path) -> None:
+def test_file_that_cannot_be_read(tmp_path):
     for file, reason in (
         (str(tmp_path), "Is a directory"),
         (str(tmp_path / "absent.csv"), "No such file"),
@@ -355,7 +261,7 @@ def test_file_that_cannot_be_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("same", [1, 4])
-def test_repeated_rows_have_no_chord(same: int) -> None:
+def test_repeated_rows_have_no_chord(same):
     """Without times only: with them the end-effector waits."""
     rows = ROWS.copy()
     rows[same] = rows[same - 1]
@@ -363,63 +269,9 @@ def test_repeated_rows_have_no_chord(same: int) -> None:
     assert_close(curve_in_time(table(TIMES, rows))(TIMES)[0][same], rows[same], 1e-13, 1.0)
 
 
-def jump(curve: Curve, order: int, at: float) -> float:
-    """Return the largest jump of a derivative at a parameter inside."""
-    step = 1e-9
-    sides = [curve(np.array([at + d]))[order] for d in (-step, step)]
-    return float(np.abs(sides[1] - sides[0]).max())
-
-
-def test_curve_in_time_goes_from_rest_to_rest() -> None:
-    """Through every row, twice (in fact four times) continuously differentiable."""
-    curve = curve_in_time(table(TIMES))
-    assert curve.end == TIMES[-1]
-    assert not curve.kinks.size
-    value, _, _ = curve(TIMES)
-    assert_close(value, ROWS, 1e-13)
-    spline = curve.moves[0][2]
-    _, first, second = spline(TIMES[[0, -1]])
-    size = [np.abs(x).max() for x in spline(np.linspace(0.0, 1.9, 99))]
-    assert_close(first, np.zeros((2, 2)), 1e-13, size[1])
-    assert_close(second, np.zeros((2, 2)), 1e-12, size[2])
-    for knot in TIMES[1:-1]:
-        # A step of 1e-9 s changes a smooth derivative by 1e-9 of the next one, some 100 times it.
-        assert jump(curve, 2, knot) < 1e-6 * size[2]
-    before = curve(np.array([-1.0, 0.0, 1.9, 5.0]))
-    assert_close(before[0], ROWS[[0, 0, -1, -1]], 1e-13)
-    assert not before[1].any()
-    assert not before[2].any()
-
-
-def test_two_rows_in_time_are_the_quintic_law() -> None:
+def test_two_rows_in_time_are_the_quintic_law():
     """Degree 5 with rest at both ends is 10 u^3 - 15 u^4 + 6 u^5."""
     curve = curve_in_time(table(np.array([0.0, 2.0]), np.array([[1.0], [4.0]])))
     u = np.linspace(0.0, 1.0, 11)
     expected = 1.0 + 3.0 * (10.0 * u**3 - 15.0 * u**4 + 6.0 * u**5)
     assert_close(curve(2.0 * u)[0][:, 0], expected, 1e-13)
-
-
-def test_curve_by_chord_is_the_natural_cubic_spline() -> None:
-    """Through every row at its share of the chords' length; the third derivative jumps."""
-    curve = curve_by_chord(table())
-    lengths = [0.0, 0.5, np.hypot(0.8, 0.1), np.hypot(0.1, 0.5), np.hypot(0.6, 0.1)]
-    places = np.cumsum(lengths) / np.sum(lengths)
-    assert_close(curve(places)[0], ROWS, 1e-14)
-    assert_close(curve.kinks, places[1:-1], 1e-15)
-    assert_close(curve(np.array([0.0, 1.0]))[2], np.zeros((2, 2)), 1e-12, 10.0)
-    for a, b in pairwise(places):  # linear between the rows
-        ends = curve(np.array([a, 0.5 * (a + b), b - 1e-15]))[2]
-        assert_close(0.5 * (ends[0] + ends[2]), ends[1], 1e-11, 10.0)
-    for knot in places[1:-1]:
-        assert jump(curve, 2, knot) < 1e-5
-
-
-@pytest.mark.parametrize("t", [TIMES, None], ids=["time", "chord"])
-def test_derivatives(t: np.ndarray | None) -> None:
-    """By differences, away from the rows."""
-    curve = curve_by_chord(table()) if t is None else curve_in_time(table(t))
-    u = curve.end * np.array([0.07, 0.31, 0.55, 0.91])
-    value, first, second = curve(u)
-    assert value.shape == (4, 2)
-    assert_close(derivative(lambda h: curve(u + h)[0], 2e-3), first, 1e-10)
-    assert_close(derivative(lambda h: curve(u + h)[1], 2e-3), second, 1e-10)

@@ -3,8 +3,6 @@
 doi:10.1109/SII.2019.8700380.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from bodies import spatial_mechanism

@@ -10,10 +10,8 @@ from remainders import built_of
 from runs import TWO_ARM, by_root, contents, summary_of
 
 import dolfinopt as do
-from dolfinopt.fem.forms import ELEMENTS
 from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import run_folder as results
-from dolfinopt.output.design import gather_views
 from dolfinopt.output.run_folder import write_result
 
 WORLD = MPI.COMM_WORLD
@@ -145,17 +143,6 @@ def test_loops_in_space_leave_their_forces_and_what_follows(tmp_path):
     assert "of 5 equations 3 follow from the others" in told
 
 
-@pytest.mark.serial
-def test_prescribed_motion_leaves_what_it_left(tmp_path):
-    scene = do.load_scene(TWO_ARM, ["arms.cells=[16,2]", "motion.base=fixed", "motion.radius=0.4"])
-    arrays, table, summary, _ = left_by(scene, tmp_path)
-    assert "q_r_desired" not in arrays and "closure_force" not in arrays
-    assert arrays["joint_forces"].shape[1] == 3
-    drives = [name for name in table.dtype.names if name.startswith("joint_force")]
-    assert drives == ["joint_force_arm1", "joint_force_arm2"]  # a fixed base is no drive
-    assert list(summary["units"]["drive_peak"]) == ["arm1", "arm2"]
-
-
 # -- what a run leaves: the same files from both ways, the summary last  --------------------------
 
 
@@ -230,15 +217,3 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         write_result(shared_tmp_path, one, 1.0)
     assert not (shared_tmp_path / "summary.json").exists()
-
-
-@pytest.mark.parametrize("element", [*ELEMENTS])
-def test_views_of_arms_without_a_current_design(element):
-    """Designs that studies read but never assembled; nodes between corners are not drawn."""
-    built = built_of(do.load_scene(TWO_ARM, [*SMALL, f"arms.element={element}"]))
-    views = gather_views(built.scene, built.partition, built.arms, built.uniform())
-    if WORLD.rank == 0:
-        assert [view.name for view in views] == ["arm1", "arm2"]
-        for view in views:
-            assert view.corners.shape == (60, 4, 2) and view.modes.shape[-1] == 0
-            assert view.corners[..., 0].max() - view.corners[..., 0].min() == pytest.approx(1.0)

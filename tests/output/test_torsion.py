@@ -1,7 +1,5 @@
 """What a run says where cells are too few for the torsion of its motion."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,7 +14,7 @@ STIFFNESS = 3e5, 2e3  # of bending, N/m, and torsion, N m
 FOUND = {(1, 1): 0.186, (2, 2): 0.186, (3, 3): 0.09, (4, 4): 0.052, (6, 6): 0.024, (6, 4): 0.031}
 
 
-def bar() -> tuple[SimpleNamespace, np.ndarray]:
+def bar():
     """Return a body that bends in y and turns about x, and both by its coordinates."""
     outboard = np.zeros((6, 2))
     outboard[1, 0] = outboard[3, 1] = 1.0

@@ -1,28 +1,22 @@
 """Pictures of the plane and of curves: the arrays that are drawn, and that something is seen."""
 
 from dataclasses import replace
-from itertools import pairwise
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from bodies import plane_body, plane_chain
 from machines import GAINS, controlled, loop
-from matplotlib.collections import PathCollection
 from mpi4py import MPI
 from PIL import Image
 
 import dolfinopt as do
-from dolfinopt.multibody.closures import Along, Loops, Tie
+from dolfinopt.multibody.closures import Loops
 from dolfinopt.multibody.kinematics import end_effector
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.multibody.tree import Mechanism
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import ArmView
-from dolfinopt.plots import curves, design, machine, style
-from dolfinopt.plots.poses import POSES, body_poses, shown_poses
+from dolfinopt.plots import curves, design, machine
 from dolfinopt.scene.load import scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -30,7 +24,7 @@ pytestmark = pytest.mark.serial  # one rank shows all there is
 LENGTHS = (1.0, 0.7, 0.4)  # m
 
 
-def beam(name: str, length: float, height: float, nx: int, ny: int) -> ArmView:
+def beam(name, length, height, nx, ny):
     """Return rectangles, solid above the axis, with modes u = (x, 0) and u = (-2 x y, x^2)."""
     x = np.linspace(0.0, length, nx + 1)
     y = np.linspace(-0.5 * height, 0.5 * height, ny + 1)
@@ -44,7 +38,7 @@ def beam(name: str, length: float, height: float, nx: int, ny: int) -> ArmView:
     return ArmView(name, corners, centroid, density, np.stack([stretch, bend], axis=-1))
 
 
-def body(outboard: np.ndarray, length: float) -> ShapeIntegrals:
+def body(outboard, length):
     """Return a body of which only what places it in the plane has a meaning."""
     q = outboard.shape[1]
     none = np.zeros((q, q))
@@ -55,18 +49,18 @@ def body(outboard: np.ndarray, length: float) -> ShapeIntegrals:
     )  # fmt: skip
 
 
-def beam_body(length: float) -> ShapeIntegrals:
+def beam_body(length):
     return body(np.array([[length, 0.0], [0.0, length**2], [0.0, 2.0 * length]]), length)
 
 
-def manipulator(arms: int) -> tuple[list[ArmView], Mechanism]:
+def manipulator(arms):
     lengths = LENGTHS[:arms]
     views = [beam(f"arm{k}", length, 0.06, 20, 4) for k, length in enumerate(lengths)]
     bodies = tuple(beam_body(length) for length in lengths)
     return views, plane_chain(bodies, 6.0, 0.0, (0.0, 0.0), joint_height=-0.5)
 
 
-def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Tie | None = None) -> Any:
+def motion(mechanism, t, q_r, q_e, desired=None, closure=None):
     """Return what pictures ask of a trajectory."""
     end = end_effector(mechanism, still(q_r), q_e)
     return SimpleNamespace(
@@ -76,7 +70,7 @@ def motion(mechanism: Mechanism, t, q_r, q_e, desired=None, closure: Tie | None 
     )  # fmt: skip
 
 
-def swinging(mechanism: Mechanism) -> Any:
+def swinging(mechanism):
     """Return a motion; the deviation is some centimetres."""
     arms = len(mechanism.bodies)
     t = np.linspace(0.0, 2.0, 41)
@@ -84,11 +78,11 @@ def swinging(mechanism: Mechanism) -> Any:
     return motion(mechanism, t, q_r, 0.01 * np.sin(np.outer(t, 2.0 + np.arange(2 * arms))))
 
 
-def still(q: np.ndarray) -> RigidMotion:
+def still(q):
     return RigidMotion(q, np.zeros_like(q), np.zeros_like(q))
 
 
-def shown(figure) -> np.ndarray:
+def shown(figure):
     """Return a figure's pixels (height, width, 3); nothing may be beyond its edges, nor blank."""
     figure.canvas.draw()
     box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
@@ -106,33 +100,6 @@ def test_magnification_is_round_from_1_to_100_and_turns_ends_no_further_than_arm
     for share in np.geomspace(1.2e-3, 0.05, 40):  # the deviation is about a tenth of the size
         magnified = machine.round_magnification(share * 0.7, 0.7) * share
         assert 0.1 / np.sqrt(2.6) < magnified < 0.1 * np.sqrt(2.6)
-
-
-def test_ticks_and_marks_are_round_and_inside():
-    np.testing.assert_allclose(style.ticks(0.0, 1.0), np.linspace(0.0, 1.0, 11))
-    np.testing.assert_allclose(style.ticks(-0.05, 1.07, 5), np.linspace(0.0, 1.0, 6))
-    assert "-0" not in [f"{tick:g}" for tick in style.ticks(-1e-17, 1.0)]
-    for largest in (0.0, 0.9, 1.0, 3.3, 61.0, 1234.0):
-        marks = design.scale_marks(largest)
-        assert 2 <= len(marks) <= 9 and marks[0] == 0.0
-        assert largest <= marks[-1] * (1.0 + 1e-9) and marks[-1] <= max(1.6 * largest, 1.0)
-
-
-@pytest.mark.parametrize("arms", [1, 6])
-@pytest.mark.parametrize("tall", [0.06, 1.2])
-def test_axes_below_each_other_have_one_scale(arms, tall):
-    """And fit on a page, however tall arms are."""
-    sizes = np.array([1.0, tall]) / np.arange(1, arms + 1)[:, None]
-    figure, rows = style.stacked_axes([(0.0 * size, size) for size in sizes], "title", least=0.4)
-    width, height = figure.get_size_inches()
-    assert width <= style.WIDTH + 1e-9 and height <= style.HEIGHT + 0.4 * arms + 5.0
-    boxes = [axes.get_window_extent() for axes in rows]
-    for axes, box, size in zip(rows, boxes, sizes, strict=True):
-        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
-        assert (left, right) == (0.0, 1.0) and low <= 1e-9 and high >= size[1] - 1e-9
-        assert box.width / (right - left) == pytest.approx(box.height / (high - low))
-    assert all(box.y0 > after.y1 for box, after in pairwise(boxes))
-    assert boxes[-1].y0 > 0.0 and boxes[0].y1 < figure.bbox.height
 
 
 def test_design_shows_each_density_in_its_place():
@@ -159,27 +126,6 @@ def test_design_shows_each_density_in_its_place():
     assert "axis distance 1 m, 0.2 m high" in rows[0].get_title(loc="left")
     assert "[m]" in rows[1].get_xlabel() and "[m]" in rows[0].get_ylabel()
     assert scale.get_xlim() == (0.0, 1.0) and "density" in scale.get_xlabel()
-
-
-def test_stress_says_where_when_and_in_what_unit():
-    """Largest value, place and instant above every arm; a scale of round numbers; a ring."""
-    views = []
-    for name, largest in (("arm1", 61e6), ("arm2", 40e6)):
-        view = beam(name, 1.0, 0.1, 20, 4)
-        s = largest * (1.0 - view.centroid[:, 0]) / (1.0 - view.centroid[0, 0])
-        views.append(replace(view, stress=s, stress_instant=np.full(len(s), 0.75)))
-    figure = design.stress_figure(views, "two arms")
-    first, second, scale = figure.axes
-    assert "arm1:  largest 61 MPa at x = 25, y" in first.get_title(loc="left")
-    assert "arm2:  largest 40 MPa" in (words := second.get_title(loc="left"))
-    assert "t = 0.75 s" in words
-    assert "[MPa]" in scale.get_xlabel() and scale.get_xlim() == (0.0, 70.0)
-    for axes, view in zip((first, second), views, strict=True):
-        np.testing.assert_allclose(axes.collections[0].get_array(), 1e-6 * view.stress)
-        assert axes.collections[0].get_clim() == (0.0, 70.0)
-    np.testing.assert_allclose(first.lines[0].get_xydata(), views[0].centroid[:1])
-    assert not second.lines
-    shown(figure)
 
 
 @pytest.mark.parametrize("count", [1, 400])
@@ -242,65 +188,6 @@ def test_deviation_shows_millimetres_and_names_the_largest_where_it_is():
         shown(curves.deviation_figure(t, deviation, 1.3 * deviation))
 
 
-def cells_of(axes) -> list[PathCollection]:
-    return [each for each in axes.collections if isinstance(each, PathCollection)]
-
-
-@pytest.mark.parametrize("magnification", [1.0, 20.0])
-def test_magnified_arms_join(magnification):
-    views, mechanism = manipulator(3)
-    film = machine.make_film(swinging(mechanism), magnification, 5)
-    for frame in range(5):
-        for k, view in enumerate(views):
-            cells = film.bent.material(view.corners, view.modes, k, frame)
-            for end, place in ((0.0, film.bent.origin), (LENGTHS[k], film.bent.outboard)):
-                axis = np.all(np.abs(view.corners - [end, 0.0]) < 1e-12, axis=-1)
-                assert axis.any()
-                np.testing.assert_allclose(cells[axis] - place[frame, k], 0.0, atol=1e-13)
-
-
-@pytest.mark.parametrize("off", [0.0, 0.01])
-def test_film_magnifies_deformation_and_control_errors(off):
-    """From the first to the last instant, the end-effector where the magnified machine has it."""
-    mechanism = manipulator(2)[1]
-    desired, t, q_e = (getattr(swinging(mechanism), name) for name in ("q_r", "t", "q_e"))
-    actual = desired + off * np.cos(t)[:, None]
-    moving = motion(mechanism, t, actual, q_e, desired)
-    for magnification in (1.0, 3.0):
-        film = machine.make_film(moving, magnification, 7)
-        magnified = still(desired + magnification * (actual - desired))
-        wanted = end_effector(mechanism, magnified, magnification * q_e)
-        np.testing.assert_allclose(film.trace, wanted, atol=1e-14)
-        np.testing.assert_allclose(film.bent.end, wanted[film.at], atol=1e-14)
-        rigid = end_effector(mechanism, still(desired), 0.0 * q_e)
-        np.testing.assert_allclose(film.desired, rigid, atol=1e-14)
-        assert (film.t[0], film.t[-1], len(film.t)) == (0.0, 2.0, 7)
-        np.testing.assert_allclose(film.t, t[film.at])
-    largest = np.linalg.norm(moving.end - rigid, axis=1).max()
-    chosen = machine.make_film(moving, None, 7).magnification
-    assert chosen == machine.round_magnification(largest, sum(LENGTHS[:2]))
-    assert len(machine.make_film(moving, 1.0, 1000).t) == len(t)
-
-
-@pytest.mark.parametrize(("arms", "magnification"), [(1, 100.0), (3, 20000.0)])
-def test_film_has_all_labels_inside_and_one_scale(arms, magnification):
-    views, mechanism = manipulator(arms)
-    moving = swinging(mechanism)
-    moving.q_e = moving.q_e / magnification
-    film = machine.make_film(moving, magnification, 3)
-    stage = machine.film_stage(views, film, 0.333)
-    frames = machine.Frames(stage, film)
-    frames.draw(1)
-    assert f"deformation x {magnification:g}" in stage.figure.texts[0].get_text()
-    spans = np.ptp([stage.axes.get_xlim(), stage.axes.get_ylim()], axis=1)
-    box = stage.axes.get_window_extent()
-    assert spans[0] / box.width == pytest.approx(spans[1] / box.height)
-    assert len(cells_of(stage.axes)) == arms  # of the frame before nothing is left
-    frames.draw(2)
-    assert len(cells_of(stage.axes)) == arms
-    shown(stage.figure)
-
-
 def test_motion_shows_the_payload_where_it_is(tmp_path):
     views, mechanism = manipulator(2)
     moving = swinging(mechanism)
@@ -320,76 +207,6 @@ def test_motion_shows_the_payload_where_it_is(tmp_path):
             pixel = picture[round(len(picture) - y), round(x)]
             assert np.abs(pixel - [217, 95, 2]).max() <= 16
     assert (pictures[3] != pictures[0]).any(axis=2).sum() > 1000
-
-
-@pytest.mark.parametrize("arms", [1, 3])
-def test_machine_shows_every_arm_where_it_is(arms):
-    views, mechanism = manipulator(arms)
-    moving = swinging(mechanism)
-    figure = machine.machine_figure(views, moving, "title")
-    axes = figure.axes[0]
-    rigid = body_poses(mechanism, moving.q_r, 0.0 * moving.q_e)
-    at = shown_poses(rigid)
-    assert len(at) == POSES
-    assert [text.get_text() for text in axes.texts] == [f"{moving.t[n]:.2f} s" for n in at]
-    cells = cells_of(axes)
-    assert len(cells) == arms * len(at)
-    # Void is left open: half of each arm's 80 cells.
-    assert {sum(len(path) for path in each.get_paths()) for each in cells} == {40 * 5}
-    ends = [line.get_xydata()[0] for line in axes.lines if line.get_markersize() == 10.0]
-    np.testing.assert_allclose(ends, rigid.end[at])
-    solid = np.abs(shown(figure) - [8, 29, 88]).max(axis=2) < 12
-    assert solid.sum() > 2000
-
-
-def slider_crank() -> tuple[list[ArmView], Any]:
-    """Return a rigid crank and a bending rod whose end is on y = 0, over more than a turn."""
-    crank = replace(beam("crank", 0.3, 0.2, 10, 2), modes=np.zeros((20, 4, 2, 0)), designed=False)
-    views = [crank, beam("rod", 0.7, 0.06, 20, 4)]
-    bodies = (body(np.zeros((3, 0)), 0.3), beam_body(0.7))
-    mechanism = plane_chain(bodies, 0.5, 0.0, (0.0, 0.0), joint_height=0.0)
-    t = np.linspace(0.0, 0.1, 61)
-    angle = 80.0 * t
-    desired = np.stack([0.0 * t, angle, -angle - np.arcsin(0.3 * np.sin(angle) / 0.7)], axis=1)
-    q_e = 0.002 * np.stack([0.1 * np.sin(angle), np.sin(angle)], axis=1)
-    # The rod's end, bent by w, is on the line: sin(beta) (L + u) + cos(beta) w = -height.
-    u, w = 0.7 * (1.0 + q_e[:, 0]), 0.49 * q_e[:, 1]
-    turned = -np.arcsin(0.3 * np.sin(angle) / np.hypot(u, w)) - np.arctan2(w, u)
-    actual = np.stack([0.0 * t, angle, turned - angle], axis=1)
-    across = Along(np.array([0.0, 1.0]))
-    closure = Tie("closure", (1, 0), None, np.zeros(2), np.eye(2), (across,))
-    return views, motion(mechanism, t, actual, q_e, desired, closure)
-
-
-def test_magnified_loops_stay_closed():
-    """To first order: off the line by little where the deformation is a tenth of the rod."""
-    views, moving = slider_crank()
-    assert np.abs(moving.end[:, 1]).max() < 1e-12
-    film = machine.make_film(moving, 50.0, 9)
-    assert np.abs(film.rigid.end[:, 1]).max() < 1e-12
-    sag = views[1].modes[-1, 2, 1, 1] * film.bent.q_e[:, 1]
-    assert np.abs(sag).max() > 0.04
-    assert np.abs(film.bent.end[:, 1]).max() < 0.25 * np.abs(sag).max()
-    stage = machine.film_stage(views, film, 0.5)
-    frames = machine.Frames(stage, film)
-    for frame in range(9):
-        frames.draw(frame)
-        (block,) = [p for p in stage.axes.patches if p.get_alpha() is not None]
-        np.testing.assert_allclose(block.get_xy()[:4].mean(axis=0), film.bent.end[frame])
-    assert "0.5 kg" in stage.figure.legends[0].texts[-1].get_text()
-    shown(stage.figure)
-
-
-def test_machine_shows_one_turn_of_a_loop():
-    views, moving = slider_crank()
-    figure = machine.machine_figure(views, moving, "slider-crank")
-    axes = figure.axes[0]
-    named = [float(text.get_text().removesuffix(" s")) for text in axes.texts]
-    np.testing.assert_allclose(80.0 * np.array(named), np.pi / 4 * np.array([1, 3, 5, 7]), atol=0.2)
-    # Every pose ends on the line but for the deformation, which is not drawn.
-    ends = [line.get_xydata()[0] for line in axes.lines if line.get_markersize() == 10.0]
-    np.testing.assert_allclose(np.array(ends)[:, 1], 0.0, atol=2e-3)
-    shown(figure)
 
 
 @pytest.mark.slow

@@ -9,14 +9,10 @@ from PIL import Image
 from runs import ROOT
 
 import dolfinopt as do
-from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.mesh.solid_cells import TENSOR
-from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.multibody.shape_integrals import linear_part
 from dolfinopt.output.design import ArmView, designed
-from dolfinopt.part.solid.surface import surface_at
 from dolfinopt.plots import machine, solid
-from dolfinopt.plots.design import design_figure, stress_figure
+from dolfinopt.plots.design import design_figure
 from dolfinopt.plots.poses import body_poses
 
 pytestmark = pytest.mark.serial
@@ -73,20 +69,6 @@ def test_picture_of_a_link():
     assert box.x0 >= 0.0 and box.x1 <= figure.get_figwidth()
 
 
-def test_surface_carries_fields_and_cells():
-    """Fields that are linear in space stay so on the surface; every triangle knows its cell."""
-    view = link(lambda x: 1.2 * (1.0 - x[:, 0] / SIZE[0]))
-    surface = solid.material(view, modes=True)
-    points = surface.points
-    assert surface.fields["modes"] == pytest.approx(points[..., None] * [1.0, 2.0], abs=1e-6)
-    middle = surface.corners.mean(axis=1)
-    away = np.abs(middle - view.centroid[surface.cells]) * CELLS / SIZE
-    assert away.max() <= 0.5 + 1e-5
-    corners = view.corners[:, TENSOR[8, 3]]
-    volume = surface_at(corners, view.density, 0.5).volume
-    assert volume == pytest.approx(cell_sizes(corners).sum() * (1.0 - 0.5 / 1.2), rel=1e-3)
-
-
 @pytest.fixture(scope="module")
 def result():
     """A simulation of coarse solid links, the second on a bearing that gives way."""
@@ -95,20 +77,6 @@ def result():
                "joints.elbow.bearing_stiffness=[1e7,1e7,1e7,1e5,1e5,0]")  # fmt: skip
     model = do.Model(do.load_scene(ROOT / "demos" / "spatial_arm.toml", changes))
     return model.simulate(stress=True)
-
-
-def test_poses_lead_to_the_end_effector(result):
-    one = result.trajectory
-    poses = body_poses(one.mechanism, one.q_r, one.q_e)
-    bodies = tuple(map(linear_part, one.mechanism.bodies))
-    end = end_effector(replace(one.mechanism, bodies=bodies), one.motion, one.q_e)
-    assert np.abs(one.q_e).max() > 0.01  # it bends
-    assert poses.end == pytest.approx(end, abs=1e-14)
-    assert poses.outboard[:, one.mechanism.end[0]] == pytest.approx(end, abs=1e-14)
-    # The shoulder's axis is horizontal and turns with the yaw.
-    yaw, axis = one.q_r[:, 0], one.mechanism.joints[1].axis
-    flat = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=1)
-    assert poses.rotation[:, 1] @ axis == pytest.approx(flat, abs=1e-14)
 
 
 def test_picture_of_a_machine_in_space(result):
@@ -146,31 +114,6 @@ def test_figures_of_a_model_in_space(result):
     assert any(word.endswith(" mm") for word in words)
     assert np.ptp(np.asarray(axes.images[0].get_array())) > 150
     assert len(result.plot_stress().axes) == 3  # and the colour scale
-
-
-def test_colours_of_stress():
-    """The half with the larger stress is drawn darker; the caption tells where it is."""
-    view = link(lambda x: np.ones(len(x)))
-    stress = np.where(view.centroid[:, 0] < 0.25, 1e6, 9e7)
-    stress[7] = 1e8
-    view = replace(view, stress=stress, stress_instant=np.full(len(stress), 0.25))
-    x, y, z = 1e3 * view.centroid[7]
-    (panel, scale) = stress_figure([view], "title").axes
-    words = f"100 MPa at x = {x:.4g}, y = {y:.4g}, z = {z:.4g} mm, t = 0.25 s"
-    assert panel.get_title(loc="left").endswith(words)
-    assert scale.get_xlim() == (0.0, 100.0) and "[MPa]" in scale.get_xlabel()
-    image = np.asarray(panel.images[0].get_array()).astype(int)
-    extent = panel.images[0].get_extent()
-
-    def colour_at(point):
-        x, y = solid.LINKS.plane(np.array(point)) - [extent[0], extent[2]]
-        size = image.shape[1] / (extent[1] - extent[0])
-        return image[image.shape[0] - 1 - round(y * size), round(x * size)]
-
-    calm, strained = colour_at([0.2, 0.0, 0.025]), colour_at([0.4, 0.0, 0.025])
-    assert calm[1] > 200 > 60 > strained[1]  # light yellow, dark red
-    (ring,) = [line.get_xydata() for line in panel.lines if line.get_marker() == "o"]
-    np.testing.assert_allclose(ring, solid.LINKS.plane(view.centroid[7:8]))
 
 
 def test_film_in_space(result, tmp_path):

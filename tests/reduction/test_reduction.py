@@ -1,10 +1,7 @@
-"""Reduced bases against dense eigenproblems, full solves and beam theory."""
-
-from __future__ import annotations
+"""Reduced bases against dense eigenproblems and full solves."""
 
 import dataclasses
 import gc
-import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +23,6 @@ from dolfinopt.reduction.eigenproblem import (
     complement_solve,
     lowest_eigenpairs,
 )
-from dolfinopt.reduction.methods import quadrature
 
 COMM, SELF = MPI.COMM_WORLD, MPI.COMM_SELF
 LENGTH, HEIGHT, THICKNESS = 1.0, 0.06, 0.01  # m
@@ -186,16 +182,6 @@ def test_modes_keep_the_interfaces(shared_arm, method):
     assert np.array_equal(basis.MV, arm.mass_times(basis.V))
 
 
-@pytest.mark.parametrize("method", ["modal", "craig-bampton", "krylov"])
-def test_every_degree_of_freedom(method):
-    """As many coordinates as the arm has: the reduced model is the full one."""
-    arm, own = (with_densities(make_arm((3, 1), comm), graded) for comm in (COMM, SELF))
-    body = shape_integrals(arm, ALL[method](arm, Options(arm.num_dofs)), 0.0)
-    reduced = scipy.linalg.eigvalsh(body.K, body.M)
-    assert arm.num_dofs == 11
-    assert reduced == pytest.approx(scipy.linalg.eigvalsh(*dense(own)), rel=DENSE)
-
-
 def test_too_many_modes_are_an_error_that_says_so():
     with pytest.raises(ConvergenceError, match=r"arm 'arm': only \d+ of 5.*reduction\.coordinates"):
         lowest_eigenpairs(Pencil(with_densities(make_arm((2, 1)), uniform)), 5, None)
@@ -252,26 +238,6 @@ def test_a_mode_of_another_symmetry_becomes_the_lowest():
         along, across = np.abs(basis.MV[:, :, 3].sum(axis=0))
         kinds.add("stretching" if along > across else "bending")
     assert kinds == {"stretching", "bending"}  # the crossing took place
-
-
-@pytest.mark.serial
-def test_modes_point_the_same_way_on_any_mesh():
-    seen = {method: [] for method in ALL}
-    for cells in ((20, 2), (40, 4), (60, 6)):
-        arm = with_densities(make_arm(cells, COMM), uniform)
-        owned = arm.operators.space.dofmap.index_map.size_local
-        # No mode counted here rests at a quarter of the length.
-        place = np.abs(arm.points[:owned] - [0.25 * LENGTH, 0.5 * HEIGHT]).max(axis=1) < 1e-6
-        for method, values in seen.items():
-            # Fixed at both ends, the fourth bending mode and stretching are too close to count.
-            # Ritz vectors of subspaces settle later than modes.
-            basis = ALL[method](arm, Options(6 if method in REDUCTORS else 4))
-            values.append(COMM.allreduce(basis.V[:owned][place].sum(axis=0)))
-    for values in seen.values():
-        larger = np.argmax(np.abs(values[0]), axis=0)
-        ways = [np.sign(value[larger, np.arange(len(larger))]) for value in values]
-        assert np.array_equal(ways[0], ways[1]) and np.array_equal(ways[0], ways[2])
-        assert ways[0].all()
 
 
 def inputs(arm):
@@ -362,24 +328,6 @@ def test_balanced_is_the_dense_gramians_dominant_space(stubby_arm, design, band)
     # And optimal: responses lose no more energy than the eigenvalues left out.
     lost = np.trace(P) - np.trace(ours.T @ P @ ours)
     assert lost == pytest.approx(values[:-6].sum(), rel=1e-7)  # measured: 3e-9
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.0, 300.0), (50.0, 180.0), (120.0, 1000.0)])
-def test_quadrature_resolves_resonances(low, high):
-    """Products of two resonances against adaptive quadrature told where they peak."""
-    peaks, damping = np.array([100.0, 170.0, 5e3]), 2e-5  # 0.1 % of critical damping
-    omega, weights = quadrature(low, high, 1.0 / peaks**2, damping)
-    assert (omega > low).all() and (omega < high).all()
-
-    def product(w, a, b):
-        gain = [1.0 / (1.0 + 1j * damping * w - (w / peak) ** 2) for peak in (a, b)]
-        return (gain[0] * gain[1].conjugate()).real
-
-    inside = [peak for peak in peaks if low < peak < high]
-    for pair in itertools.combinations_with_replacement(peaks, 2):
-        told = {"points": inside, "limit": 500, "epsabs": 0.0, "epsrel": 1e-11}
-        exact = scipy.integrate.quad(product, low, high, pair, **told)[0]
-        assert weights @ product(omega, *pair) == pytest.approx(exact, rel=1e-7)
 
 
 FIRST = 49.0  # Hz; replaced by the arm's first frequency
@@ -482,41 +430,3 @@ def test_ranks_agree_with_one_rank(at, method, q):
     for ours, reference in pairs:
         scale = np.abs(reference).max(initial=0.0)  # of further interfaces: none
         assert np.abs(np.asarray(ours) - reference).max(initial=0.0) <= 1e-9 * scale
-
-
-SHEAR = YOUNG / (2.0 * (1.0 + POISSON))  # Pa
-AREA, INERTIA = HEIGHT * THICKNESS, THICKNESS * HEIGHT**3 / 12.0  # m2, m4
-SHEAR_FACTOR = 5.0 / 6.0  # exact for the energy of parabolic shear over a rectangle
-
-
-def rates_and_limit(values):
-    """Return the orders seen in three successive differences of v + c h^p, and the limit v."""
-    steps = np.diff(values, axis=0)
-    rates = np.log2(steps[:-1] / steps[1:])
-    return rates, values[-1] + steps[-1] / (2.0 ** rates[-1] - 1.0)
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_tip_compliance_converges_to_timoshenko():
-    """Clamped bar with a rigid end face under forces and moment there."""
-    compliance = []
-    for cells in ((50, 3), (100, 6), (200, 12), (400, 24)):
-        arm = make_arm(cells)
-        ones = np.ones(arm.mesh.num_cells)
-        C = tip_compliance(craig_bampton(arm.at(YOUNG * ones, DENSITY * ones), Options(3)))
-        compliance.append([C[0, 0], C[1, 1], C[2, 2], C[1, 2]])
-    compliance = np.array(compliance)
-    bending = LENGTH**3 / (3.0 * YOUNG * INERTIA) + LENGTH / (SHEAR_FACTOR * SHEAR * AREA)
-    turning = LENGTH / (YOUNG * INERTIA)
-    theory = np.array([LENGTH / (YOUNG * AREA), bending, turning, 0.5 * LENGTH * turning])
-    assert (np.diff(compliance, axis=0) > 0.0).all()  # displacement elements are too stiff
-    # Bending: 5.5 %, 1.5 %, 0.5 %, 0.2 % below theory.
-    rates, limit = rates_and_limit(compliance[:, 1:])
-    # Measured: 1.90, 1.95. Stress singularities in the clamped corners, of order 1.5, are weak.
-    assert (rates > 1.85).all() and (rates < 2.05).all()
-    # Both end faces keep their height, which Poisson's contraction would change: about a height's
-    # length of each end is stiffer, by up to nu^2, and nu^2 h / L = 0.65 %. Measured: bending
-    # 0.12, 0.08, 0.08 %, stretching 0.18 %.
-    ends = POISSON**2 * HEIGHT / LENGTH
-    assert np.abs(limit / theory[1:] - 1.0).max() < 0.25 * ends
-    assert abs(compliance[-1, 0] / theory[0] - 1.0) < 0.4 * ends

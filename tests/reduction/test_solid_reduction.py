@@ -1,7 +1,5 @@
 """Reduction of solid arms against the full model: six interface coordinates."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import scipy.linalg
@@ -11,9 +9,9 @@ from runs import ROOT
 from solids import DENSITY, HEIGHT, LENGTH, THICKNESS, YOUNG, tensors_of
 
 import dolfinopt as do
-from dolfinopt.fem.elasticity import ElasticArm, Substructure
+from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.mesh.arm_mesh import box_arm
-from dolfinopt.reduction import METHODS, Basis, Options, frame_fields
+from dolfinopt.reduction import METHODS, Options, frame_fields
 
 pytestmark = pytest.mark.serial  # ranks: tests/arms/test_solid_arm.py
 BETA = 2e-5  # s, damping D = BETA K
@@ -22,7 +20,7 @@ BETA = 2e-5  # s, damping D = BETA K
 class Full:
     """A graded arm without symmetry, unreduced: dense K, M, responses of interface and frame."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         mesh = box_arm(MPI.COMM_SELF, "a", (LENGTH, HEIGHT, THICKNESS), (6, 2, 2))
         x = 0.6 + 0.35 * np.sin(mesh.centroid @ [9.0, 170.0, 260.0])
         self.arm = Substructure(tensors_of(mesh, "incompatible")).at(YOUNG * x**3, DENSITY * x)
@@ -35,29 +33,29 @@ class Full:
         self.inputs = np.hstack([loads, inertia])
         self.frequencies = np.sqrt(scipy.linalg.eigvalsh(self.K, self.M)) / (2.0 * np.pi)
 
-    def response(self, frequency: float) -> np.ndarray:
+    def response(self, frequency):
         """Return H (12, 12), complex, at a frequency in Hz."""
         return _response(self.K, self.M, self.inputs, frequency)
 
 
-def _response(K: np.ndarray, M: np.ndarray, inputs: np.ndarray, frequency: float) -> np.ndarray:
+def _response(K, M, inputs, frequency):
     omega = 2.0 * np.pi * frequency
     return inputs.T @ np.linalg.solve((1.0 + 1j * omega * BETA) * K - omega**2 * M, inputs)
 
 
 @pytest.fixture(scope="module")
-def full() -> Full:
+def full():
     return Full()
 
 
-def reduced(arm: ElasticArm, basis: Basis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def reduced(arm, basis):
     """Return K, M and the inputs (q, 12) in the basis."""
     M = np.tensordot(basis.V, basis.MV, ((0, 1), (0, 1)))
     inertia = np.tensordot(basis.MV, frame_fields(arm), ((0, 1), (0, 1)))
     return basis.stiffness, M, np.hstack([basis.outboard.T, inertia])
 
 
-def distance(found: np.ndarray, exact: np.ndarray) -> float:
+def distance(found, exact):
     """Return the largest difference of two responses, in the units of their diagonal."""
     size = np.sqrt(np.abs(np.diag(exact)))
     return float(np.abs((found - exact) / np.outer(size, size)).max())

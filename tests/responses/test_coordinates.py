@@ -1,14 +1,12 @@
 """The choice of coordinates: what the estimate is worth, and that every use of a scene keeps it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from mpi4py import MPI
-from remainders import Built, build, built_of, wave
+from remainders import Built, build, wave
 from runs import TWO_ARM, overrides, refused, run, summary_of
 
 import dolfinopt as do
@@ -17,34 +15,33 @@ from dolfinopt.dynamics.build import simulate
 from dolfinopt.optimization import assessment, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.responses import order_selection as coordinates
-from dolfinopt.responses.order_selection import Comparison, OrderSelection
-from dolfinopt.study.cases import simulate_scenarios
+from dolfinopt.responses.order_selection import Comparison
 
 WORLD = MPI.COMM_WORLD
 AUTO = 'reduction.coordinates="auto"'
 SHORT = "motion.horizon=1.9"
 
 
-def auto(*overrides: str, tolerance: float = 1e-2, cells: tuple[int, int] = (24, 3)) -> Built:
+def auto(*overrides, tolerance=1e-2, cells=(24, 3)):
     linear = "simulation.stiffening=false"  # what is estimated here is the number of modes alone
     reduced = f"reduction.tolerance={tolerance}"
     return build(AUTO, reduced, SHORT, linear, *overrides, cells=cells)
 
 
-def error(built: Built, x: dict[int, np.ndarray], count: int) -> float:
+def error(built, x, count):
     return Comparison(*built.place, x, built.profile).error(count)
 
 
-def choose(built: Built, x: dict[int, np.ndarray]) -> OrderSelection:
+def choose(built, x):
     choice = do.choose_coordinates(built.scene, built.partition, built.arms, x, built.profile)
     assert choice is not None
     return choice
 
 
-def clouds(seed: int, crisp: bool):
+def clouds(seed, crisp):
     """Return smooth random densities in [0.1, 1], or void and solid, as a function of place."""
 
-    def field(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    def field(k, x, y):
         rng = np.random.default_rng([seed, k])
         total = np.zeros_like(x)
         for _ in range(12):
@@ -71,7 +68,7 @@ CELLS = (30, 4)
 SHAKEN = ("damping.stiffness_proportional=1e-5", "payload.mass=2", "motion.duration=1.2")
 
 
-def moved(built: Built, count: int, method: str):
+def moved(built, count, method):
     """Return scene and arms by a number of coordinates, to be integrated more finely."""
     data = built.scene.to_dict()
     data["reduction"] |= {"coordinates": count, "tolerance": 1e-3, "method": method}
@@ -114,30 +111,6 @@ def test_estimate_is_the_error(name, method, overrides):
     assert estimate == pytest.approx(max(worst), rel=0.1)
 
 
-@pytest.mark.serial  # ranks: test_any_number_of_ranks
-def test_scenarios_count():
-    """The worst of them, each posed by itself."""
-    heavy = "payload.mass=9"
-    built = auto(f"scenarios=[{{changes=['{heavy}', 'material.young_modulus=60e9']}}]")
-    alone = auto(heavy, "material.young_modulus=60e9"), auto()
-    x = built.fields(wave)
-    parts = [error(one, x, 4) for one in alone]
-    # Steps are those of the scene that needs most: right to TIME_SHARE of the tolerance.
-    assert error(built, x, 4) == pytest.approx(max(parts), rel=0.02)
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_motions_are_compared_at_the_same_instants():
-    """Where the richer one is looked at half as often: the instants of the other."""
-    built = auto()
-    parts = built.scene, built.partition, built.arms, built.fields(wave), built.profile
-    comparison = coordinates.Comparison(*parts)
-    found = comparison.error(4)
-    if (one := comparison.motion) is not None:
-        comparison.motion = one.at(one.t[::2])
-    assert comparison.error(4) == pytest.approx(found, rel=1e-12)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "tolerance"),
@@ -165,20 +138,6 @@ def test_fewest_that_meet_the_tolerance(overrides, tolerance):
         assert arm.reduce(x[k]).num_modes == choice.coordinates
 
 
-@pytest.mark.serial  # ranks: test_any_number_of_ranks
-def test_shared_design_counts_like_two():
-    """Two arms of one design err as if each had its own."""
-    shared, own = auto("arms.arm2.design=arm1"), auto()
-    found = [error(b, b.fields(lambda k, *at: wave(0, *at)), 4) for b in (shared, own)]
-    assert found[0] == pytest.approx(found[1], rel=1e-9)
-
-
-def test_three_arms():
-    changes = AUTO, "arms.cells=[24,3]", "reduction.tolerance=1e-2", "motion.horizon=1.9"
-    built = built_of(do.load_scene(TWO_ARM.parent / "three_arm.toml", changes))
-    assert choose(built, {k: arm.uniform(0.5) for k, arm in built.arms.items()}).error <= 1e-2
-
-
 def test_a_given_number_costs_nothing():
     built = build("reduction.coordinates=5", SHORT)
     before = replace(built.profile.counts)
@@ -186,14 +145,6 @@ def test_a_given_number_costs_nothing():
     assert do.choose_coordinates(*place) is None
     assert built.profile.counts == before
     assert all(arm.coordinates == 5 and arm.basis is None for arm in built.arms.values())
-
-
-@pytest.mark.serial  # ranks have no part in it
-def test_more_coordinates_than_dofs_are_not_tried():
-    """2 x 1 cells: 2 dofs at each of two free nodes and 3 of the interface, 7 in all: exact."""
-    built = auto("payload.mass=0.1", "motion.horizon=1.9", tolerance=1e-5, cells=(2, 1))
-    choice = choose(built, built.fields(wave))
-    assert choice.coordinates <= 7
 
 
 def test_none_is_enough(monkeypatch):
@@ -212,7 +163,7 @@ def test_unresolved():
             arm.reduce(built.fields(wave)[k])
 
 
-def small(*overrides: str, iterations: int = 3):
+def small(*overrides, iterations=3):
     settings = ["arms.cells=[24,3]", "motion.horizon=1.9", f"optimizer.max_iterations={iterations}"]
     return do.load_scene(TWO_ARM, (*settings, "reduction.tolerance=0.01", AUTO, *overrides))
 
@@ -270,20 +221,11 @@ def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
         assert "estimated error of 0.02, above reduction.tolerance = 0.01" in warning
 
 
-@pytest.mark.serial  # ranks: test_any_number_of_ranks
-def test_cases():
-    """Every scene has its own choice: a light payload shakes the arms more than a heavy one."""
-    scenes = [small(f"payload.mass={mass}") for mass in (0.5, 9.0)]
-    light, heavy = (one.choice.coordinates for one in simulate_scenarios(scenes, None))
-    (alone,) = simulate_scenarios(scenes[1:], None)
-    assert light > heavy == alone.choice.coordinates
-
-
 @pytest.mark.serial
 def test_commands(tmp_path, capsys):
     """Each says what it chose; a picture drawn anew takes the number from the summary."""
 
-    def said(*words: object) -> str:
+    def said(*words):
         run(*words, *overrides("arms.cells=[24,3]", AUTO))
         return capsys.readouterr().out
 
@@ -300,14 +242,3 @@ def test_commands(tmp_path, capsys):
     assert chosen in said("export", TWO_ARM, "--out", tmp_path / "e")
     assert sentence in said("gradient", TWO_ARM, "--out", tmp_path / "g.npz")
     assert scene_of(tmp_path / "s").reduction.coordinates == found["coordinates"]
-
-
-@pytest.mark.serial
-def test_arm_from_a_file(tmp_path):
-    """It keeps the coordinates that the file has; the other's are chosen."""
-    run("export", TWO_ARM, "--out", tmp_path, "--set", "arms.cells=[24,3]")
-    built = auto(f"arms.arm1.sid={tmp_path / 'arm1.sid'}", tolerance=1e-3)
-    choice = choose(built, built.fields(wave))
-    _, trajectory = built.evaluate(built.fields(wave))
-    sizes = [body.num_modes for body in trajectory.mechanism.bodies]
-    assert sizes == [4, choice.coordinates]

@@ -4,28 +4,17 @@ Remainders are of second order along random directions. The reference is the who
 densities that are changed, and on meshes whose nodes are moved.
 """
 
-from __future__ import annotations
-
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 from loops import BOOM_TABLE, SOFT, bennett, boom, closed, four_bar
 from machines import demo_machine
-from moved_nodes import built_with, node_test, noise
-from remainders import built_of, hold_instants, limit_rates, rates, taylor, wave
-from runs import by_root, minimising
+from moved_nodes import node_test
+from remainders import built_of, hold_instants, limit_rates, taylor, wave
+from runs import by_root
 
 import dolfinopt as do
-from dolfinopt.arms.arm import Arm
-from dolfinopt.arms.design_state import DesignState
 from dolfinopt.fem.forms import ELEMENTS
-from dolfinopt.fem.shape_derivative import ShapeDerivative
-from dolfinopt.responses.evaluation import gradient
-from dolfinopt.responses.products import Products, by_nodes
 from dolfinopt.responses.response import constraints_of
-from dolfinopt.responses.sensitivity import esl_gradient
 from dolfinopt.scene.tables.responses import DECLARED, objective_kinds
 
 ROUGHLY = ("simulation.tolerance=1e-3", "simulation.sample=0.01", "objective.gradient=exact")
@@ -77,7 +66,7 @@ CLOSED = {
 }
 
 
-def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
+def scene_of(base, changes, folder):
     """Return a scene with keys changed, FOLDER standing for the files' one (collective)."""
     by_root(lambda: [(folder / file).write_text(text) for file, text in FILES.items()])
     if base in CLOSED:
@@ -88,7 +77,7 @@ def scene_of(base: str, changes: tuple[str, ...], folder: Path) -> do.Scene:
     return demo_machine(name, (*quick, *changes), folder, one_arm=base == "one_arm")
 
 
-def case(base: str, kind: str, *changes: str, ranks: bool = False, slow: bool = False):
+def case(base, kind, *changes, ranks=False, slow=False):
     """Return a case: base, objective ("": the base's own) and keys."""
     lightest = kind in ("mass", "effort", "peak_force")
     kept = ["constraints.compliance=1e6"] * lightest  # N m; far away
@@ -166,30 +155,23 @@ CASES = [
     # Prescribed motions in the plane.
     case("two_arm", "", "reduction.coordinates=3"),
     case("two_arm", WHOLE, "reduction.coordinates=4", ranks=True),
-    case("two_arm", "", "reduction.coordinates=6", *LOADED),
-    case("two_arm", "", MODAL, "reduction.coordinates=1"),
     case("two_arm", "", MODAL, "reduction.coordinates=4", *LOADED),
-    case("two_arm", "", "damping.stiffness_proportional=0.0"),
     case("two_arm", "deviation", *LOADED),
     case("two_arm", WHOLE, "payload.mass=0.2", "arms.passive=0.09", *LOADED),
-    case("two_arm", "effort", "payload.mass=0.5"),
     case("two_arm", "effort", MODAL, BENT, *LOADED),
-    case("two_arm", "effort", BENT, GRAVITY),
     case("two_arm", "deviation", BENT),
     case("two_arm", WHOLE, *SKEW, BENT),
     *(case("two_arm", WHOLE, f"arms.element={name}", bent)
       for name in ELEMENTS for bent in (LINEAR, BENT)),
     *(case("two_arm", WHOLE, "reduction.method=krylov", f"reduction.coordinates={q}",
            f"reduction.shifts={shifts}", "payload.mass=1")
-      for q, shifts in ((3, [0.0]), (4, [0.0]), (8, [0.0]), (13, [0.0]), (8, [0.0, 30.0]))),
+      for q, shifts in ((4, [0.0]), (13, [0.0]), (8, [0.0, 30.0]))),
     # Nothing moves: neither basis nor integrator matters.
     case("two_arm", "static", ranks=True),
     case("two_arm", "static", "reduction.method=balanced", "objective.gradient=esl", ranks=True),
     case("two_arm", "static", "arms.arm2.length=0.7", "arms.height=0.1",
          "objective.loads=[[0.0,1.0,0.0],[30.0,1.0,-2.0],[0.0,0.0,1.0]]", ranks=True),
-    case("two_arm", "static", "arms.passive=0.1", SIMP, ranks=True),
     case("two_arm", "static", SHARED, ranks=True),
-    case("two_arm", "static", *SKEW, ranks=True),
     case("two_arm", "eigenfrequency", ranks=True),
     case("two_arm", "eigenfrequency", "objective.gradient=esl", ranks=True),
     case("two_arm", "eigenfrequency", "objective.elbow_angle=2.1", "payload.inertia=0.4"),
@@ -197,17 +179,14 @@ CASES = [
     case("two_arm", "eigenfrequency", "objective.attached=point-mass"),
     case("two_arm", "eigenfrequency", "objective.attached=none", "arms.passive=0.1"),
     case("two_arm", "eigenfrequency", SHARED, "objective.exponent=3.0"),
-    case("two_arm", "eigenfrequency", SHARED, "objective.attached=point-mass"),
     case("two_arm", "eigenfrequency", "arms.joint_mass=2.0", "arms.joint_inertia=0.1"),
     case("two_arm", "eigenfrequency", "arms.arm1.rigid=true", ranks=True),
-    case("two_arm", "eigenfrequency", "arms.arm2.rigid=true"),
     case("two_arm", "eigenfrequency", "arms.arm2.density=8000.0", "arms.arm2.young_modulus=2e11",
          SIMP),
     # Stress.
     case("two_arm", "stress", LINEAR),
     case("two_arm", "stress", BENT, "damping.stiffness_proportional=1e-3"),
     case("two_arm", "stress", BENT, MODAL),
-    case("two_arm", "stress", "reduction.method=krylov"),
     case("two_arm", "stress", "arms.element=linear", "objective.stress_margin=0.1"),
     case("two_arm", "stress", TWO),
     case("controlled", "stress"),
@@ -222,14 +201,12 @@ CASES = [
     # Two arms of one design, by the densities of one; of the same size, or scaled.
     *(case("two_arm", kind, *REPEATED, ranks=kind == "static")
       for kind in ("esl", "static", "eigenfrequency", "deviation")),
-    case("two_arm", "static", *REPEATED, SIMP),
     # Other numbers of arms.
     case("one_arm", WHOLE, "motion.law=trapezoidal"),
     case("three_arm", "", "motion.law=s-curve", "objective.load_cases=5", slow=True),
     # Machines: control, hardware at the joints, closed loops.
     case("controlled", ""),
     case("controlled", "", BENT, GRAVITY),
-    case("controlled", WHOLE, GRAVITY, "control.feed_forward=none"),
     case("controlled", WHOLE, "control.feed_forward=none", DRIVES),
     case("controlled", WHOLE, *JOINT, "motion.cart_mass=2.0", "arms.arm2.rotor_inertia=1e-4",
          "arms.arm2.gear_ratio=30.0", slow=True),
@@ -240,7 +217,6 @@ CASES = [
     case("controlled", "deviation", GRAVITY, *GEARS, BEARINGS, WOUND, RUB),
     case("controlled", "effort", GRAVITY, *GEARS, WOUND, RUB),
     case("two_arm", "effort", GRAVITY, BEARINGS, *YIELDING, RUB, slow=True),
-    case("controlled", "effort", GRAVITY),
     case("controlled", "effort", GRAVITY, "control.limits=[150.0,200.0,150.0]", DRIVES, *YIELDING,
          *FINER, slow=True),
     case("two_arm", "effort", *JOINT, *YIELDING),
@@ -251,7 +227,6 @@ CASES = [
     case("slider", "", CRANK, "control.limits=[36.0]", GRAVITY),  # of 43 N m asked for
     case("slider", "", CRANK, "control.stiffness=[0.0]", GRAVITY),
     case("slider", "effort", GRAVITY),
-    case("slider", "effort", CRANK),
     case("slider", "effort", CRANK, WOUND, "arms.crank.gear_stiffness=3e3",
          "arms.rod.gear_stiffness=0", "arms.friction=[0.1,0.5]", "arms.rod.cells=[24,3]"),
     case("slider", "effort", CRANK, "control.limits=[40.0]"),
@@ -272,7 +247,6 @@ CASES = [
          slow=True),
     case("space", "stress", LINEAR, *IN_SPACE, TWO_IN_SPACE, slow=True),
     case("fork", "eigenfrequency"),
-    case("fork", "eigenfrequency", STIFF),
     # Closed loops in space.
     case("boom", ""),
     case("boom", "effort", BOOM_HELD, slow=True),
@@ -301,17 +275,14 @@ CASES = [
     case("two_arm", "buckling", BENT, *LOADED, ranks=True),
     case("one_arm", "buckling", LINEAR, MODAL, ranks=True),
     case("two_arm", "buckling", SIMP, SHARED),
-    case("two_arm", "buckling", TWO),
     case("controlled", "buckling"),
     case("slider", "buckling", GRAVITY, "motion.speed=30"),
     case("fork", "buckling"),
     case("space", "buckling", LINEAR),
     # Forces on interfaces.
     case("two_arm", "deviation", BENT, *LOADED, PUSHED, ranks=True),
-    case("two_arm", "effort", PUSHED, slow=True),
     case("two_arm", "stress", BENT, PUSHED, slow=True),
     case("two_arm", "buckling", BENT, PUSHED, slow=True),
-    case("two_arm", "deviation", TWO, PUSHED, slow=True),
     case("controlled", "deviation", GRAVITY, UNFORESEEN, slow=True),
     case("controlled", "effort", GRAVITY, PUSHED, slow=True),
     case("slider", WHOLE, CRANK, TRUST),
@@ -341,7 +312,7 @@ CASES = [
 ]  # fmt: skip
 
 
-def contract(base: str, changes: tuple[str, ...], folder: Path, patch) -> do.Scene:
+def contract(base, changes, folder, patch):
     """Return the scene, whose stress and buckling look at what they look at, come what may."""
     # Instants that come and go beneath the cut would make small steps of the p-mean.
     patch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
@@ -350,7 +321,7 @@ def contract(base: str, changes: tuple[str, ...], folder: Path, patch) -> do.Sce
 
 
 @pytest.mark.parametrize(("base", "changes"), CASES)
-def test_by_densities(base, changes, shared_tmp_path, monkeypatch) -> None:
+def test_by_densities(base, changes, shared_tmp_path, monkeypatch):
     """Along a random and a smooth direction; the gradient by ESL points the same way."""
     scene = contract(base, changes, shared_tmp_path, monkeypatch)
     kind = scene.objective.kind
@@ -371,7 +342,7 @@ def test_by_densities(base, changes, shared_tmp_path, monkeypatch) -> None:
 
 
 LOADS = "constraints.stiffness=[{arm='arm1', force=[3.0,100.0], moment=-5.0, displacement=1e-4}, "
-LOADS += "{arm='arm2', moment=2.0, displacement=1e-4, rotation=2e-3}]"
+LOADS += "{arm='arm2', moment=2.0, rotation=2e-3}]"
 LOADS_IN_SPACE = (
     "constraints.stiffness=[{arm='link1', force=[0.0,100.0,20.0], moment=[3.0,0.0,0.0], "
     "displacement=1e-4, rotation=2e-3}, {arm='link2', force=[0.0,0.0,1.0], displacement=1.0}]"
@@ -387,7 +358,7 @@ LIMITS = [
 
 
 @pytest.mark.parametrize(("base", "changes"), LIMITS)
-def test_limits_by_densities(base, changes, shared_tmp_path) -> None:
+def test_limits_by_densities(base, changes, shared_tmp_path):
     """Of every value that is limited, over its limit."""
     scene = scene_of(base, changes, shared_tmp_path)
     # Of a motion by steps at which what is left of the time error stays below the remainders.
@@ -414,14 +385,12 @@ NODES = [
     case("one_arm", "buckling", BENT, SKEWED, ranks=True),
     # Of unknown cells before it is meshed: on two ranks one looks on.
     case("one_arm", "stress", *TRIANGLES, BENT, SKEWED, ranks=True),
-    case("controlled", "esl", *TRIANGLES, LINEAR),
     case("controlled", "deviation", *TRIANGLES, BENT),
     case("controlled", "settling", *TRIANGLES, BENT),
     case("controlled", "effort", *TRIANGLES, BENT),
     case("controlled", "stress", *TRIANGLES, BENT),
     *(case("two_arm", WHOLE, f"arms.element={name}", BENT)
       for name in ("incompatible", "linear", "quadratic")),
-    case("two_arm", "mass", LINEAR),
     case("two_arm", "stress", BENT),
     case("two_arm", "buckling", BENT),
     *(case(base, kind, *changes) for base in ("tetrahedra", "space")
@@ -440,7 +409,7 @@ NODES = [
 
 
 @pytest.mark.parametrize(("base", "changes"), NODES)
-def test_by_nodes(base, changes, shared_tmp_path, monkeypatch) -> None:
+def test_by_nodes(base, changes, shared_tmp_path, monkeypatch):
     """Along random moves of all nodes of uneven meshes, those of interfaces included."""
     monkeypatch.setattr("dolfinopt.parallel.SPLIT_CELLS", 1)  # one arm on two ranks is cut in two
     scene = contract(base, changes, shared_tmp_path, monkeypatch)
@@ -448,80 +417,3 @@ def test_by_nodes(base, changes, shared_tmp_path, monkeypatch) -> None:
     found = node_test(scene, wave, BASES[base][2], cut=base == "tetrahedra", response=limited)
     assert found.slope != 0.0
     assert found.rate == pytest.approx(2.0, abs=0.1)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize(
-    ("kind", "part"),
-    [("effort", "places"), (WHOLE, "interfaces"), ("stress", "volumes"),
-     ("stress", "stress"), (WHOLE, "geometric_stiffness"), ("buckling", "prestress")],
-)  # fmt: skip
-def test_what_is_left_out_is_found(kind, part, shared_tmp_path, monkeypatch) -> None:
-    """Each part of the chain by nodes alone: remainders become of first order."""
-    if part == "geometric_stiffness":
-
-        def none(*_: object) -> float:
-            return 0.0
-
-        monkeypatch.setattr(ShapeDerivative, part, none)
-    else:
-
-        def without(state: DesignState, products: Products) -> np.ndarray:
-            return by_nodes(state, replace(products, **{part: None}))
-
-        monkeypatch.setattr("moved_nodes.by_nodes", without)
-    told = f"objective.kind={kind}", "payload.mass=0.1", "constraints.compliance=1e6", BENT, SKEWED
-    scene = contract("two_arm", (*TRIANGLES, *told), shared_tmp_path, monkeypatch)
-    assert node_test(scene, wave, 0.015).rate < 1.7
-
-
-@pytest.mark.serial
-def test_height_of_a_bar_bent_by_a_moment(shared_tmp_path) -> None:
-    """Compliance M^2 L / (E t h^3 / 12) and mass: exact in quadratic triangles without nu."""
-    moment, told = 3.0, (*TRIANGLES, "objective.kind=static", "material.poisson_ratio=0.0")  # N m
-    scene = scene_of("two_arm", (*told, f"objective.loads=[[0,0,{moment}]]"), shared_tmp_path)
-    built = built_with(scene, lambda arm, x: np.zeros_like(x))
-    built.evaluate(built.uniform(1.0))
-    found = []  # derivatives by the relative height of every arm: a step of h / h
-    for one in (scene, minimising(scene, "mass")):
-        by_place = gradient(one, built.partition, built.arms, None, built.profile, by=by_nodes)
-        heights = {k: arm.mesh.mesh.geometry.x[:, 1] for k, arm in built.arms.items()}
-        found.append([float(by_place[k][:, 1] @ y) for k, y in heights.items()])
-    arm, material = scene.arms[0], scene.material
-    bent = moment**2 * arm.length / (material.young_modulus * arm.thickness * arm.height**3 / 12.0)
-    assert found[0] == pytest.approx([-3.0 * bent] * 2, rel=1e-8)
-    mass = material.density * arm.length * arm.height * arm.thickness
-    assert found[1] == pytest.approx([mass] * 2, rel=1e-12)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("base", ["two_arm", "tetrahedra"])
-def test_frozen_loads_by_nodes(base, shared_tmp_path) -> None:
-    """The gradient by equivalent static loads is that of the compliance under held loads."""
-    size, cut = BASES[base][2], base == "tetrahedra"
-    scene = scene_of(base, (*TRIANGLES * (not cut), LINEAR), shared_tmp_path)
-    loads: list[np.ndarray] = []
-
-    def compliance(h: float) -> tuple[Arm, float]:
-        def places(arm: str, x: np.ndarray) -> np.ndarray:
-            return size * (0.2 * noise(arm, x, 7) + h * noise(arm, x))
-
-        arm = next(iter(built_with(scene, places, cut).arms.values()))
-        arm.state(np.ones(arm.mesh.num_cells))
-        elastic = arm.current.elastic
-        nodes = elastic.interior_nodes  # in an order that moves may change
-        if not loads:
-            interior, outboard = elastic.restrict(elastic.stiffness_times(arm.current.basis.V))
-            nodal = np.zeros(arm.current.basis.V.shape)
-            nodal[nodes] = interior.reshape(len(nodes), *nodal.shape[1:])
-            loads.extend((nodal, outboard))
-        interior = loads[0][nodes].reshape(-1, loads[0].shape[2])
-        u = elastic.static_response(interior, loads[1])
-        return arm, float(np.trace(elastic.energy_matrix(u)))
-
-    arm, _ = compliance(0.0)
-    found = esl_gradient(arm.current, np.eye(loads[0].shape[2]), by_nodes)
-    even: dict[str, np.ndarray] = {}
-    built_with(scene, lambda name, x: np.zeros_like(x), cut, even)
-    slope = size * float(np.sum(found * noise(arm.mesh.name, even[arm.mesh.name])))
-    assert rates(lambda h: compliance(h)[1], slope) == pytest.approx(2.0, abs=0.05)

@@ -1,9 +1,5 @@
 """Responses as users of the package write them: one class, registered, as objective or limit."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 from declared import withdrawn
@@ -11,12 +7,9 @@ from remainders import beside_volume, build, limit_rates, wave
 from runs import TWO_ARM
 
 import dolfinopt as do
-from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.parallel import on_all_ranks, together
 from dolfinopt.responses.motion import Deviation
 from dolfinopt.responses.response import (
-    Analysis,
-    CellGradient,
     Measured,
     Response,
     constraints_of,
@@ -36,7 +29,7 @@ class Roughness(Response):
 
     level = 0.3
 
-    def measure(self, analysis: Analysis) -> Measured:
+    def measure(self, analysis):
         with together(analysis.partition.world):
             mine = {
                 k: float(one.mesh.area @ (one.x_phys - self.level) ** 2)
@@ -48,7 +41,7 @@ class Roughness(Response):
             self.name, tuple(analysis.scene.arms[k].name for k in found), values, values
         )
 
-    def gradients(self, analysis: Analysis) -> list[CellGradient]:
+    def gradients(self, analysis):
         return [
             {
                 k: 2.0 * one.mesh.area * (one.x_phys - self.level) * float(k == owner)
@@ -61,18 +54,18 @@ class Roughness(Response):
 class MeanSquare(Deviation):
     """Integral of |e|^2 over the horizon, m2 s."""
 
-    def value(self, y: np.ndarray, weights: np.ndarray) -> float:
+    def value(self, y, weights):
         return float(weights @ (y**2).sum(axis=1))
 
-    def gradient(self, y: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    def gradient(self, y, weights):
         return 2.0 * weights[:, None] * y
 
-    def extreme(self, trajectory: Trajectory) -> float:
+    def extreme(self, trajectory):
         return self.of_motion(trajectory)
 
 
 @pytest.fixture(autouse=True, scope="module")
-def _declared() -> Iterator[None]:
+def _declared():
     """Declare both; leave the scenes of other tests without these words."""
     with withdrawn():
         response(
@@ -91,7 +84,7 @@ QUICK = "arms.cells=[24,4]", "simulation.sample=0.01", "reduction.coordinates=3"
 
 
 @pytest.mark.serial
-def test_a_new_response_is_minimised() -> None:
+def test_a_new_response_is_minimised():
     """The optimiser finds what is known: x0 everywhere; nothing but the result is simulated."""
     words = [*QUICK, "optimizer.max_iterations=60", "objective.kind=roughness"]
     scene = do.load_scene(TWO_ARM, words)
@@ -104,7 +97,7 @@ def test_a_new_response_is_minimised() -> None:
 
 
 @pytest.mark.serial
-def test_a_new_response_is_a_limit() -> None:
+def test_a_new_response_is_a_limit():
     """Of the stiffest design that is nearly even: the limit is met and in its row's name."""
     options = [*QUICK, "optimizer.max_iterations=60", "objective.kind=static"]
     limit, options = 2e-4, [*options, "design.initial=0.4"]
@@ -128,7 +121,7 @@ def test_a_new_response_is_a_limit() -> None:
 
 @pytest.mark.serial
 @pytest.mark.parametrize("name", ["deviation", "mean_square"])
-def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
+def test_an_objective_of_the_motion_is_a_limit(name):
     """The same class on the other side: value over limit less 1, with the gradient of that."""
     built = build(*QUICK, "objective.kind=static", "objective.gradient=exact",
                   "motion.horizon=1.9", "simulation.tolerance=1e-7",
@@ -142,7 +135,7 @@ def test_an_objective_of_the_motion_is_a_limit(name: str) -> None:
     assert limit_rates(built, (4e-2, 1e-2)) == pytest.approx([2.0], abs=0.2)
 
 
-def test_limits_are_found_by_their_keys() -> None:
+def test_limits_are_found_by_their_keys():
     """One response, one class, whatever its limit is called."""
     built = build("constraints.first_frequency=3.0", "constraints.tip_deflection=1e-6")
     names = [one.response.name for one in constraints_of(built.scene)]
@@ -152,7 +145,7 @@ def test_limits_are_found_by_their_keys() -> None:
 
 @pytest.mark.parametrize("scale", [1e-150, 1.0, 1e150])
 @pytest.mark.parametrize("exponent", [2.0, 20.0, 200.0])
-def test_p_norm(scale: float, exponent: float) -> None:
+def test_p_norm(scale, exponent):
     """Between the largest value and its bound, derivative by differences; no over- or underflow."""
     rng = np.random.default_rng(3)
     values = scale * rng.uniform(0.5, 1.0, 5)
@@ -177,13 +170,13 @@ def test_p_norm(scale: float, exponent: float) -> None:
     assert not by_vectors[0].any()
 
 
-def test_p_norm_of_nothing() -> None:
+def test_p_norm_of_nothing():
     assert p_norm(np.zeros(3), 20.0)[0] == 0.0
     assert not p_norm(np.zeros(3), 20.0)[1].any()
     assert p_norm_of_lengths(np.zeros((3, 2)), 20.0)[0] == 0.0
 
 
-def test_the_least_made_smooth() -> None:
+def test_the_least_made_smooth():
     """At most the least value, derivative by differences; a single value is itself."""
     values = [3.0, 2.0, 2.2]
     least, slopes = worst_of(values, 20.0, least=True)

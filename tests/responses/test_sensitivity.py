@@ -1,26 +1,15 @@
 """Exact gradients: trajectories by differences, what a wrong one does, the cost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from remainders import taylor, wave
 from runs import TWO_ARM, demo, refused, scene
-from scipy.optimize import brentq
 
-import dolfinopt as do
-from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics.adjoint import Adjoint
 from dolfinopt.multibody.shape_integrals import scaled
-from dolfinopt.optimization.gradient_check import TaylorTest
 from dolfinopt.reduction import METHODS, AdjointFields, Method
-
-WORLD = MPI.COMM_WORLD
-
 
 QUICK = ("arms.cells=[24,3]", "motion.horizon=2.2", "simulation.tolerance=1e-3")
 # At random designs of undamped arms the remainder's cubic part outweighs its square at 0.01.
@@ -28,7 +17,7 @@ FINER = tuple(0.00125 / 4.0**k for k in range(3))
 LOADED = ["motion.gravity=[0.5,-9.81]", "payload.inertia=0.05"]
 
 
-def rates(test: TaylorTest) -> dict[str, float]:
+def rates(test):
     return {row.direction: round(row.rate, 3) for row in test.rows}
 
 
@@ -38,14 +27,14 @@ def rates(test: TaylorTest) -> dict[str, float]:
         ("reduction.method", "balanced", "craig-bampton"),
     ],
 )
-def test_nothing_to_check(key: str, value: str, remedy: str) -> None:
+def test_nothing_to_check(key, value, remedy):
     """Where there is no exact gradient, one line says so and what to choose."""
     with refused(str(TWO_ARM), key, value, remedy):
         taylor(scene(*QUICK, f"{key}={value}"), wave, FINER)
 
 
 @pytest.mark.serial  # ranks have no part in it
-def test_frozen_deviation_stands_beside_the_exact_one() -> None:
+def test_frozen_deviation_stands_beside_the_exact_one():
     """Static loads tell most of a heavy payload's deviation, but not all."""
     test = taylor(scene(*QUICK, "objective.kind=deviation"), wave, FINER)
     assert test.passed, rates(test)
@@ -55,16 +44,16 @@ def test_frozen_deviation_stands_beside_the_exact_one() -> None:
     assert abs(exact - frozen) > 0.1 * abs(exact)
 
 
-def no_modes(patch: pytest.MonkeyPatch) -> None:
-    def nothing(_: object, basis, *__: object) -> AdjointFields:
+def no_modes(patch):
+    def nothing(_, basis, *__):
         return AdjointFields(0.0 * basis.V, 0.0 * basis.V)
 
     frozen = {name: Method(method.reduce, nothing) for name, method in METHODS.items()}
     patch.setattr("dolfinopt.responses.sensitivity.METHODS", frozen)
 
 
-def no_trajectory(patch: pytest.MonkeyPatch) -> None:
-    def none(adjoint: Adjoint, *_: object):
+def no_trajectory(patch):
+    def none(adjoint, *_):
         return [
             replace(scaled(body, 0.0, 0.0, 0.0), outboard=np.zeros_like(body.outboard))
             for body in adjoint.system.mechanism.bodies
@@ -73,17 +62,17 @@ def no_trajectory(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Adjoint, "by_bodies", none)
 
 
-def no_start(patch: pytest.MonkeyPatch) -> None:
+def no_start(patch):
     patch.setattr("dolfinopt.dynamics.adjoint.add_gradients", lambda first, _: first)
 
 
-def no_filter(patch: pytest.MonkeyPatch) -> None:
+def no_filter(patch):
     patch.setattr("dolfinopt.arms.arm.Arm.backward", lambda arm, slope, _: arm._active(slope))
 
 
 @pytest.mark.serial  # ranks have no part in it
 @pytest.mark.parametrize("fault", [no_modes, no_trajectory, no_start, no_filter])
-def test_a_wrong_gradient_is_found(monkeypatch: pytest.MonkeyPatch, fault) -> None:
+def test_a_wrong_gradient_is_found(monkeypatch, fault):
     """Each part of the chain left out alone: the remainders become of first order, or less."""
     fault(monkeypatch)
     finest = (2e-5, 5e-6)
@@ -92,40 +81,9 @@ def test_a_wrong_gradient_is_found(monkeypatch: pytest.MonkeyPatch, fault) -> No
     assert min(row.rate for row in test.rows) < 1.3
 
 
-@cache
-def fixed_frequencies(height: float) -> tuple[float, float]:
-    """Return lambda of the first axial and the second bending mode, interfaces fixed, rad2/s2."""
-    # The axial one is the only mode with a mean displacement along the arm.
-    loaded = scene(*QUICK, "reduction.coordinates=6", f"arms.height={height!r}")
-    arm = Arm(loaded, 0, MPI.COMM_SELF, do.Profile())
-    body = arm.reduce(arm.uniform(0.5))
-    values = np.diag(body.K)[3:]
-    axial = int(np.argmax(np.abs(body.w[0, 4:])))
-    return float(values[axial]), float(np.delete(values, axial)[1])
-
-
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize("apart", [0.0, 1e-6], ids=["equal", "close"])
-def test_repeated_frequencies(apart: float) -> None:
-    """Bending and axial modes of one frequency mix anyhow, and the gradient does not care."""
-
-    def gap(height: float) -> float:
-        axial, bending = fixed_frequencies(height)
-        return bending / axial - 1.0 - apart
-
-    height = float(brentq(gap, 0.47, 0.51, xtol=1e-15, rtol=1e-14))
-    assert gap(height) == pytest.approx(0.0, abs=1e-10)  # eigenvalues are right to about 1e-12
-    changes = ["reduction.coordinates=6", "design.filter_radius=0", "payload.mass=1.0"]
-    # Softer: as many time steps as a slender arm takes; the ratio of frequencies is the same.
-    changes += [f"arms.height={height!r}", "material.young_modulus=7e8"]
-    test = taylor(scene(*QUICK, *changes), lambda k, x, y: np.full_like(x, 0.5), FINER)
-    assert test.passed, rates(test)
-    assert np.isfinite([row.slope for row in test.rows]).all()
-
-
 @pytest.mark.slow
 @pytest.mark.serial
-def test_payload_demo(shared_tmp_path, capsys) -> None:
+def test_payload_demo(shared_tmp_path, capsys):
     """Runs, tables and draws on few cells; a light payload gains by the exact gradient."""
     rows = demo("demo_payload").main(shared_tmp_path, (20, 2), (0.2,), 60)
     frozen, exact = rows

@@ -1,7 +1,5 @@
 """The yaw-pitch-pitch chain of solid links: its deviation, gradients of responses, its files."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from mpi4py import MPI

@@ -143,7 +143,7 @@ def test_loads_and_weights_at_their_limits():
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_least_duration_of_an_arc_that_follows_the_arms(scale: float) -> None:
+def test_least_duration_of_an_arc_that_follows_the_arms(scale):
     """The radius that is not stated is half of the arms' length, and the path pi times that."""
     scene = scene_from_dict({
         "material": {"young_modulus": 70e9, "poisson_ratio": 0.33, "density": 2700.0},

@@ -3,7 +3,6 @@
 import copy
 import os
 import re
-from typing import Any
 
 import numpy as np
 import pytest
@@ -228,7 +227,7 @@ def test_a_wrong_interface_of_a_force_is_told_before_that_the_right_one_is_idle(
 TURN = "t,turn\n0,0.5\n1,1.0\n"
 
 
-def changed(tree: dict, path: tuple[Any, ...], value: Any) -> dict:
+def changed(tree, path, value):
     """Return a scene with another value at a path; None takes it away."""
     new = copy.deepcopy(tree)
     put_at(new, path, value)
@@ -274,7 +273,7 @@ def test_kinds(tmp_path, keys, count):
     assert np.isfinite(loops.lengths).all()
 
 
-def in_plane(kind: str, **keys: Any) -> dict:
+def in_plane(kind, **keys):
     """Return the plane slider-crank or four-bar that states its loop as [[closures]]."""
     tree = {key: value for key, value in loop_tree(kind).items() if key != "closure"}
     one = {"name": "end", "kind": kind, "between": [tree["arms"][-1]["name"], "ground"]}

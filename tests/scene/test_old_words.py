@@ -1,7 +1,7 @@
 """Older words of a scene: each is read as what it is now, told once, and rewritten."""
 
 import pytest
-from runs import TWO_ARM, run
+from runs import TWO_ARM
 
 from dolfinopt.scene.load import read_scene
 from dolfinopt.scene.messages import implausible
@@ -30,25 +30,10 @@ ROBUST = ("design.projection=robust",)
         ((), "arms.arm2.pattern=arm1", "arms.arm2.design=arm1"),
     ],
 )
-def test_a_scene_in_older_words_is_that_in_those_of_now(used, old, new) -> None:
+def test_a_scene_in_older_words_is_that_in_those_of_now(used, old, new):
     duration = ["motion.duration=1.9"] if used is SHAPED else []
     older, newer = (read_scene(TWO_ARM, [*used, word, *duration]) for word in (old, new))
     assert older == newer and newer.old_words == ()
     if not old.endswith("nominal"):
         table, *_, key = old.partition("=")[0].split(".")
         assert [f"{table}.{key} is read as" in line for line in implausible(older)] == [True]
-
-
-def test_upgrade_rewrites_a_file(tmp_path) -> None:
-    """Comments and order stay; the file as it was is kept beside it."""
-    text = TWO_ARM.read_text(encoding="utf-8")
-    older = text.replace("[motion]", '[motion]\nbase = "fixed"\nbase_position = 0.1')
-    older = older.replace("projection = false", 'projection = "robust"\nlimits_on = "eroded"')
-    file = tmp_path / "scene.toml"
-    file.write_text(older, encoding="utf-8")
-    before = read_scene(file)
-    run("keys", "--upgrade", file)
-    after = read_scene(file)
-    assert after == before and before.old_words and not after.old_words
-    assert file.read_text(encoding="utf-8").count("#") == older.count("#")
-    assert after.motion.base == 0.1 and after.design.projection == "robust-eroded"

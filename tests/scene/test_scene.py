@@ -1,6 +1,5 @@
 """The scene: defaults, inheritance, overrides, and one helpful line for every kind of bad input."""
 
-import copy
 import json
 import math
 import pickle
@@ -72,74 +71,6 @@ def test_scene_is_frozen_hashable_and_picklable():
     assert scene != str(TWO_ARM)
 
 
-def test_round_trip_through_json():
-    data = minimal(3, payload={"mass": 4, "inertia": 0.1}, simulation={"sample": 0.002})
-    data["arms"][1] |= {"length": 0.7, "cells": [70, 6]}
-    before = copy.deepcopy(data)
-    scene = scene_from_dict(data, overrides=["motion.gravity=[0, -9.81]", "arms.height=0.05"])
-    assert data == before  # what was given is left as it was
-    plain = json.loads(json.dumps(scene.to_dict(), allow_nan=False))
-    assert plain == scene.to_dict()  # lists, not tuples
-    assert scene_from_dict(plain) == scene
-    assert "source" not in plain
-
-
-@pytest.mark.parametrize(
-    ("paths", "value"),
-    [
-        ("motion.flattening payload.mass design.filter_radius optimizer.max_iterations", 0),
-        ("design.filter_radius", 1.0),  # the longest arm
-        ("arms.0.cells", [MAX_CELLS, 1]),
-        ("arms.0.name", "left arm_2-b"),
-        ("arms.0.name", "2nd"),
-        ("motion.horizon", 1.9),  # no rest behind the motion
-        ("motion", {"path": "line", "start": [0, 0], "law": "septic"}),
-        ("motion", {"path": "arc", "base": -1.0}),
-        ("objective.load_cases", 3000),  # 3 s hold 3000 samples, whatever 3.0/1e-3 rounds to
-        ("reduction.coordinates", 3),
-        ("reduction.coordinates", 5177),  # 2 * 199 * 13 + 3
-        ("reduction", {"method": "modal", "coordinates": 1}),
-        ("reduction", {"coordinates": "auto", "tolerance": 1e-6}),
-        ("reduction", {"method": "krylov", "frequencies": [0.0, 9, 25.5, 80.0], "coordinates": 12}),
-        ("reduction", {"method": "balanced", "frequencies": [5, 80.0]}),
-        ("arms", [ARM]),  # one arm, on a cart or by a table on a fixed base
-        ("", {"arms": [ARM], "motion": {**JOINTS, "base": "fixed"}}),
-        ("", {"simulation": {"sample": 3.0}, "objective": {"load_cases": 1}}),
-        ("", {"objective": {"kind": "static", "gradient": "exact"},
-              "constraints": {"deviation": 0.01},
-              "scenarios": [{"changes": ["payload.mass=4"]}]}),  # of a limit alone
-        ("design", {"minimum": 0.3, "volume_fraction": 0.3}),
-    ],
-)  # fmt: skip
-def test_borders_of_the_ranges_are_allowed(paths, value):
-    for data in [changed(path, value) for path in paths.split()] or [minimal(**value)]:
-        assert isinstance(scene_from_dict(data, overrides=["arms.passive=0"]), Scene)
-
-
-def test_reducible_dofs():
-    # 3 x 2 cells: 2 columns of interior nodes with 3 nodes of 2 dofs, and the outboard interface.
-    assert Arm(**ARM, cells=(3, 2)).n_reducible == 2 * 3 * 2 + 3
-    assert Arm(**ARM, cells=(1, 9)).n_reducible == 3
-    assert Arm(**ARM, cells=(3, 2), element="incompatible").n_reducible == 2 * 3 * 2 + 3
-    # Nodes halfway, too: 5 columns of 5.
-    assert Arm(**ARM, cells=(3, 2), element="quadratic").n_reducible == 2 * 5 * 5 + 3
-
-
-@pytest.mark.parametrize("n_along", [1, 2, 3, 7, 200])
-@pytest.mark.parametrize("length", [0.7, 1.0])
-def test_passive_share_counts_centroids(n_along, length):
-    for tenths in range(5 * n_along):  # of a cell
-        if tenths % 10 == 5:
-            continue  # on a centroid, where rounding decides
-        passive = 0.1 * tenths * length / n_along
-        arm = Arm(**ARM | {"length": length}, cells=(n_along, 3), passive=passive)
-        n_solid = sum(10 * i + 5 < tenths for i in range(n_along))  # free of rounding
-        assert arm.passive_columns == n_solid
-        assert arm.passive_share == pytest.approx(2 * n_solid / n_along, abs=1e-15)
-    # A centroid on the border, a number without rounding, is not solid.
-    assert Arm(**ARM, cells=(2, 1), passive=0.25).passive_columns == 0
-
-
 def test_ends_are_solid_unless_the_scene_says_otherwise():
     for keys, length in (
         ({}, 0.015),  # a quarter of the height
@@ -159,10 +90,8 @@ def test_ends_are_solid_unless_the_scene_says_otherwise():
     ("override", "read", "value"),
     [
         ("payload.mass=4", lambda s: s.payload.mass, 4.0),
-        ("payload.mass = 4e-1", lambda s: s.payload.mass, 0.4),
         ("name=crane = big", lambda s: s.name, "crane = big"),
         ('name="crane"', lambda s: s.name, "crane"),
-        ("objective.kind = stress", lambda s: s.objective.kind, "stress"),
         ("design.projection=false", lambda s: s.design.projection, False),
         ("motion.gravity=[0, -9.81]", lambda s: s.motion.gravity, (0.0, -9.81)),
         ("payload={mass=1, inertia=2}", lambda s: (s.payload.mass, s.payload.inertia), (1, 2)),
@@ -200,8 +129,6 @@ def test_later_override_wins():
         ("payloads.mass=1", ["unknown key payloads", "payload?", "optimizer"]),
         ("arms.lenght=1", ["unknown key arms.lenght", "arms.length?", "arm2"]),
         ("arms.arm3.length=1", ["unknown key arms.arm3", "0, 1, arm1, arm2"]),
-        ("arms.2.length=1", ["unknown key arms.2", "0, 1, arm1, arm2"]),
-        ("arms.-1.length=1", ["unknown key arms.-1"]),
         ("arms." + 5000 * "1" + ".length=1", ['unknown key arms."111']),
         ("arms.1.grid=a.geo", ["unknown key arms.1.grid (arm2)", "name, length"]),
         ("arms.1.length=0", ["arms.1.length (arm2) = 0", ">= 1e-06", "[m]"]),
@@ -209,7 +136,6 @@ def test_later_override_wins():
         ("arms=3", ["arms = 3", "[[arms]]"]),
         ("material=3", ["material = 3", "name of a material", "a table"]),
         ("=1", ["key.path=value"]),
-        ("payload..mass=1", ["key.path=value"]),
         ("", ["key.path=value"]),
     ],
     ids=lambda value: value[:30] if isinstance(value, str) else "",
@@ -249,9 +175,7 @@ def test_several_problems_are_counted(pairs, overrides, more):
          " with --set payload.mass=-2: payload.mass = -2: "),
         ("arms", 5, ["arms.length=1"], ": arms = 5: "),
         ("arms", [5], ["arms.0.length=1"], ": arms.0 = 5: "),
-        ("arms", [5], ["arms.length=1"], ": arms.0 = 5: "),
         ("material", [1], ["material.density=1"], ": material = [1]: "),
-        ("material", 5, ["material.density=1"], ": material = 5: "),
     ],
 )  # fmt: skip
 def test_the_file_or_the_last_override_is_blamed(path, value, overrides, start):
@@ -267,8 +191,6 @@ BAD_VALUES = [
     ("arms.0.name", ["12"], "not a digit"),
     ("arms.0.name", [65 * "a"], "1 to 64"),
     ("arms.1.name", ["Arm1_R12"], "files of both parts would have one name"),
-    ("arms.0.length", [0.0], "a number >= 1e-06 and <= 10000"),
-    ("arms.0.thickness", [math.inf], "a finite number >= 1e-06 and <= 10000"),
     ("arms.0.design arms.1.design", ["arm2"], "an earlier arm with a design of its own"),
     ("arms.0.centre", [[0, 0, 0]], "none with rigid = false"),
     ("arms.0.mass arms.0.inertia", [1.0], "none with rigid = false"),
@@ -291,16 +213,13 @@ BAD_VALUES = [
     ("motion.rpy", [[0, 0, 0]], 'with path = "arc"'),
     ("motion.initial_joints", [[0.1]], 'with path = "arc"'),
     ("motion.start", [[0.0, 1.0]], 'the default, with path = "arc"'),
-    ("motion.end", [[0.0, math.inf]], "an array of two finite numbers"),
     ("motion.file", ["absent.csv"], "found neither /"),
     ("motion.dwells", [[[0.5, 0.4]], [[0.5, 0.7], [0.6, 0.8]]], "start before end, one after"),
     ("motion.dwells", [[[2.5, 3.5]]], "dwells that end by motion.horizon = 3 [s]"),
     ("constraints.settling_after", [1.2], "at most 1.1 [s], from motion.duration = 1.9"),
     ("motion.horizon", [1.0], "at least motion.duration = 1.9 [s]"),
     ("motion.acceleration_share", [0.3], '0.25, the default, with law = "quintic"'),
-    ("motion.speed", [1.0], "10.0, the default"),
     ("motion.start_angle", [1.0], "0.0, the default"),
-    ("motion.cart_follow", [math.nan], "a finite number"),
     ("motion.gravity", [[0, 0, -9.81]], "two numbers without [[joints]]"),
     ("payload.inertia", [[1, 1]], "an array of six numbers"),
     ("payload.arm", ["arm1"], "none without [[joints]]"),
@@ -317,18 +236,15 @@ BAD_VALUES = [
     ("objective.loads", [[[0, 1]], [0, 1, 0]], "an array of arrays of three numbers"),
     ("objective.effort_weights constraints.peak_force", [[1.0, 2.0]],
      "3 numbers, for cart, arm1, arm2"),
-    ("constraints.stiffness", [1.0], "an array of tables"),
     ("design.filter_radius", [1.001], "at most the length of the longest arm, 1.0 [m]"),
     ("material", [5], "a table with the keys name, kind, young_modulus, poisson_ratio"),
     ("motion", [[1, 2]], "a table with the keys path, radius"),
     ("arms", [[]], "[[arms]], at least one"),
-    ("arms.1", ["arm2"], "a table with the keys name, length"),
 ]  # fmt: skip
 # Values that are shown otherwise than they are, and contradictions shown at another key.
 SHOWN = [
     ("material.young_modulus", 10**400, "material.young_modulus = 2**1328...", "a number >= 1 and"),
     ("objective.load_cases", 16**5000, "objective.load_cases = 2**20000...", "at most 3000"),
-    ("optimizer.max_iterations", 16**5000, "= 2**20000...", "an integer >= 0 and <= 1000000"),
     ("payload.mass", [[[[1.0]]]], "payload.mass = [[[...]]]", "a number >= 0"),
     ("arms", {"name": "arm1"}, 'arms = {name = "arm1"}', "[[arms]], at least one"),
     ("arms.0.name", "ARM2", 'arms.1.name = "arm2"', "no other arm has"),
@@ -422,7 +338,6 @@ CONTRADICTIONS = [
     (2, {"arms.0.gear_ratio": 9.0}, "arms.0.gear_ratio", "used only with rotor_inertia"),
     # changes, the key that is shown, what is allowed
     (2, LINE | {"motion.radius": 2.0}, "motion.radius = 2.0", "1.0, the default, with path"),
-    (2, LINE | {"motion.flattening": 0}, "motion.flattening = 0", "1.0, the default"),
     (2, LINE | {"motion.end": [-1, 0]}, "motion.end = [-1, 0]", "another point than motion.start"),
     (2, {"motion.base": "fixed", "motion.cart_follow": 0.2}, "motion.cart_follow = 0.2", "0.5"),
     (2, {"motion.file": str(TWO_ARM)}, "motion.file = ", 'none with path = "arc"'),
@@ -439,7 +354,6 @@ CONTRADICTIONS = [
       for one in ([0.0], [9.0, 9.0])),
     (2, KRYLOV | {"reduction.frequencies": [0.0, 9.0], "reduction.coordinates": 5},
      "reduction.coordinates = 5", "an integer >= 6"),
-    (2, KRYLOV | {"reduction.coordinates": 2}, "reduction.coordinates = 2", "an integer >= 3"),
     (2, BALANCED | {"damping.stiffness_proportional": 0.0},
      "damping.stiffness_proportional = 0.0", 'a number > 0 with reduction.method = "balanced"'),
     (2, BALANCED | {"objective.gradient": "exact"}, 'reduction.method = "balanced"',

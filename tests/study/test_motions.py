@@ -25,7 +25,7 @@ def found(tmp_path_factory):
 
 @pytest.mark.serial
 @pytest.mark.slow
-def test_table(found) -> None:
+def test_table(found):
     """Shapers end the vibration, feed-forward the deviation; both cost time."""
     study, _, scene = found
     frame = study.tables[0].frame.set_index("motion")
@@ -47,7 +47,7 @@ def test_table(found) -> None:
 
 @pytest.mark.serial
 @pytest.mark.slow
-def test_shaped_joints_are_the_command_in_parts(found) -> None:
+def test_shaped_joints_are_the_command_in_parts(found):
     _, folder, scene = found
     table = read_table(str(folder / "motions" / "zv.csv"), scene.driven)
     assert table.t is not None
@@ -62,7 +62,7 @@ def test_shaped_joints_are_the_command_in_parts(found) -> None:
     assert np.abs(end - desired_motion(scene)(np.array([2.3])).q[0]).max() < 1e-12
 
 
-def test_vibration_is_the_first_frequency_of_the_machine() -> None:
+def test_vibration_is_the_first_frequency_of_the_machine():
     """With joints held, at the motion's end; damped in proportion to stiffness."""
     scene = do.load_scene(ROOT / "demos" / "two_arm.toml", QUICK)
     result = do.Model(scene).simulate()
@@ -74,7 +74,7 @@ def test_vibration_is_the_first_frequency_of_the_machine() -> None:
     assert frequency > 0.0
 
 
-def test_refused(tmp_path) -> None:
+def test_refused(tmp_path):
     pinned = do.load_scene(ROOT / "demos" / "four_bar.toml")
     refusal(
         lambda: study_motions(pinned, (), Runner(tmp_path, MPI.COMM_WORLD)), "feed_forward.kind"

@@ -28,7 +28,6 @@ from dolfinopt.study.sections import (
     verdict,
 )
 
-LIGHTEST = ROOT / "demos" / "lightest_two_arm.toml"
 SPATIAL = ROOT / "demos" / "spatial_arm.toml"
 WORLD = MPI.COMM_WORLD
 DEVIATION = 0.05  # m, that slender bars hold

@@ -1,9 +1,6 @@
 """Distributions, samples, statistics and Sobol' indices against closed forms."""
 
-from __future__ import annotations
-
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,7 +8,6 @@ from runs import refusal
 from scipy import stats
 
 from dolfinopt.study.uncertainty import (
-    Distribution,
     draw,
     parse_distribution,
     polynomial_indices,
@@ -73,36 +69,6 @@ def test_own_bounds_are_kept_and_what_is_no_distribution():
         refusal(lambda: parse_distribution(text), text, "expected")  # noqa: B023
 
 
-@pytest.mark.parametrize("text", MOMENTS)
-def test_polynomials_are_orthonormal(text):
-    """Moments of products by SciPy's adaptive quadrature of the density."""
-    law = parse_distribution(text)
-    x, weights = quadrature(law)
-    rows = law.polynomials(x, 4)
-    # Tails of 1e-12, times polynomials of degree 8 in them, are left out.
-    np.testing.assert_allclose((rows.T * weights) @ rows, np.eye(5), atol=1e-6)
-
-
-def quadrature(law: Distribution) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights of the double exponential rule between a law's quartiles."""
-    t, h = np.linspace(-3.5, 3.5, 401, retstep=True)
-    inner = 0.5 * np.pi * np.sinh(t)
-    slope = 0.5 * np.pi * np.cosh(t) / np.cosh(inner) ** 2
-    ends = {*law.at(np.array([0.0, 0.25, 0.5, 0.75, 1.0])), law.law.ppf(0.0), law.law.ppf(1.0)}
-    parts = list(pairwise(sorted(end for end in ends if np.isfinite(end))))
-    x = np.concatenate([0.5 * (a + b) + 0.5 * (b - a) * np.tanh(inner) for a, b in parts])
-    w = np.concatenate([0.5 * (b - a) * slope * h for a, b in parts])
-    return x, w * law.law.pdf(x)
-
-
-def test_points_of_the_unit_cube():
-    """Seeds repeat; more of a net begin alike."""
-    one = unit_points(50, 3, 7)
-    assert one.shape == (50, 3) and one.min() >= 0.0 and one.max() < 1.0
-    np.testing.assert_array_equal(one, unit_points(257, 3, 7)[:50])
-    assert not np.array_equal(one, unit_points(50, 3, 8))
-
-
 def test_statistics_of_a_normal_sample():
     """Net points give the law's figures; intervals have the width of independent samples."""
     n = 2048
@@ -152,38 +118,3 @@ def test_polynomial_on_ishigami():
     laws = [parse_distribution("normal:0:1")] * 2  # a constant has no shares
     z = draw(laws, unit_points(50, 2, 1))
     assert polynomial_indices(z, np.full(50, 2.0), laws).total[0].value == 0.0
-
-
-@pytest.mark.parametrize(
-    "texts",
-    [
-        ("normal:6:0.3", "normal:70e9:2e9", "uniform:0.9:1"),
-        ("lognormal:2:0.25", "triangular:0:1:4", "triangular:1:1:2"),
-    ],
-)
-def test_linear_model(texts):
-    """Shares (a_i s_i)^2 of the variance, whatever the distributions; nothing is left over."""
-    laws = [parse_distribution(text) for text in texts]
-    slopes = np.array([3.0 / laws[0].deviation, -2.0 / laws[1].deviation, 1.0 / laws[2].deviation])
-    exact = np.array([9.0, 4.0, 1.0]) / 14.0
-    samples = draw(laws, unit_points(100, 3, 1))
-    found = polynomial_indices(samples, 5.0 + samples @ slopes, laws)
-    for one in (found.first, found.total):
-        np.testing.assert_allclose([share.value for share in one], exact, rtol=1e-8)
-    assert found.unexplained < 1e-20
-
-
-def test_noise_is_left_unexplained():
-    """A tenth of the variance is noise; leaving one out finds it, and intervals cover."""
-    rng = np.random.default_rng(0)
-    laws = [parse_distribution("normal:0:1")] * 2
-    exact = np.array([0.8, 0.2])
-    covered = 0
-    for seed in range(20):
-        z = draw(laws, unit_points(400, 2, seed))
-        y = z @ np.sqrt(exact) + rng.normal(0.0, 1.0 / 3.0, 400)
-        found = polynomial_indices(z, y, laws)
-        assert found.unexplained == pytest.approx(0.1, abs=0.03)
-        covered += found.first[0].low <= 0.8 <= found.first[0].high
-    # 95 % intervals that hold less than 16 times of 20 have a chance of 0.3 %.
-    assert covered >= 16

@@ -12,7 +12,6 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.study import cases as computing
 from dolfinopt.study import uncertainty
 from dolfinopt.study.cases import Runner, run_cases, scales_bodies, with_sample
-from dolfinopt.study.figures import draw
 from dolfinopt.study.uncertainty import (
     nominal_value,
     parse_input,
@@ -228,16 +227,3 @@ def test_one_input_has_no_indices(folder, given):
     several = scene('scenarios=[{changes=["payload.mass=4"]}]')
     again = study(given, folder, MASS, base=several, samples=10)
     assert again.computed == 0
-
-
-@alone
-def test_pictures_show_the_samples(folder, given):
-    done = study(given, folder / "i", MASS, YOUNG, samples=32)
-    values = tables_of(done)[""].frame.to_numpy()[:, 3:5]
-    [histogram] = done.figures
-    drawn = draw(histogram)
-    for j, axes in enumerate(drawn.axes[:2]):
-        assert sum(patch.get_height() for patch in axes.patches) == 32
-        [curve] = drawn.axes[2 + j].lines
-        np.testing.assert_array_equal(curve.get_xdata(), np.sort(values[:, j]))
-        assert curve.get_ydata()[-1] == 1.0
