@@ -241,3 +241,33 @@ def test_the_algorithm_on_one_page_is_optimize():
     if ROOT:
         rows = [row.objective for row in result.rows]
         np.testing.assert_allclose(history, rows, rtol=1e-9)
+
+
+def test_a_machine_a_thousandth_as_large_has_the_same_design():
+    """Lengths times s, E times s^2, mass times s^3, times kept: defaults follow the arms."""
+    s = 1e-3
+    found = []
+    for scale in (1.0, s):
+        data = {
+            "material": {
+                "young_modulus": 70e9 * scale**2, "poisson_ratio": 0.33, "density": 2700.0,
+            },
+            "arms": [
+                {"name": "arm1", "length": scale, "height": 0.06 * scale,
+                 "thickness": 0.01 * scale, "cells": [24, 4]},
+                {"name": "arm2"},
+            ],
+            "motion": {"path": "arc", "duration": 1.9},
+            "payload": {"mass": 6.0 * scale**3},
+            "damping": {"stiffness_proportional": 2e-4},
+            "optimizer": {"max_iterations": 8},
+        }  # fmt: skip
+        model = Model(data)
+        assert model.scene.motion.radius == pytest.approx(scale)
+        assert model.scene.motion.joint_height == pytest.approx(-0.5 * scale)
+        assert model.scene.design.filter_radius == pytest.approx(0.0075 * scale)
+        found.append(model.optimize())
+    large, small = found
+    assert small.objective == pytest.approx(s**5 * large.objective, rel=1e-9)
+    for name, x in large.design.items():
+        np.testing.assert_allclose(small.design[name], x, atol=1e-6)
