@@ -20,13 +20,10 @@ from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import Column, refined
 from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Meshes, Part, mesh_parts
-from dolfinopt.part.plane.fit import fitted_sides
 from dolfinopt.part.plane.free_sides import FreeSides
-from dolfinopt.part.plane.layouts import SMALLEST_HOLE, trusses_of
+from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
-from dolfinopt.part.plane.outline import without_stubs
 from dolfinopt.part.plane.part import PlanePart
-from dolfinopt.part.plane.simpler import without_teeth
 from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import Search
 from dolfinopt.part.solid.part import SolidPart
@@ -35,9 +32,6 @@ from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
 
 REPAIRS = 3  # times that limits missed in the end are met by further steps
-START = 1.2  # distance of the first sides from the densities' outline, cells
-# Width of members that go where they end nowhere, cells: else the rod misses its stress by 45 %.
-STUB = 1.5
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 
 Outlines = Mapping[int, FreeSides]
@@ -211,16 +205,9 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
     limits = limits_of_part(
         flat.domain, flat.outline.tool_radius, scene.design.minimum_gap, min([1.0, *sizes])
     )
-    solid = part.domain if isinstance(part, SolidPart) else None
-    cell = flat.domain.cell
-    hole = SMALLEST_HOLE * max(cell, limits.tool) ** 2
-    outline = without_stubs(flat.outline, limits, STUB * cell)
-    sides = flat.sides
-    with suppress(InputError):  # where few do not keep the limits, the part's own will do
-        sides = fitted_sides(outline, limits, START * cell, sides.shape.area, hole)
-    made = FreeSides(flat, sides, limits, solid)
+    made = FreeSides(flat, flat.sides, limits, part.domain if isinstance(part, SolidPart) else None)
     result = made.nearest()
-    return (made if result is None else result[0]).simplified(without_teeth)[0]
+    return made if result is None else result[0]
 
 
 def _rank(scene: Scene, found: Found) -> tuple[float, float]:

@@ -8,7 +8,7 @@ tool.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -35,11 +35,11 @@ LEAP = 0.05  # relative: what sides make up for where a piece joins or leaves at
 TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
 # Material along an interface that the design leaves void, in cells: the interface is rigid.
 STRIP = 0.5
-# Width of members that the design has and the level has not, in cells: solid cells that share a
-# corner are joined in the finite elements. Without them a light arm has 12 holes of 17, and the
-# search from there ends 10 % heavier.
+# Least width of members, in cells, also of those that the design has and the level has not: solid
+# cells that share a corner are joined in the finite elements. Without them a light arm has 12 holes
+# of 17, and the search from there ends 10 % heavier.
 LINK = 0.5
-NECK = 0.3  # width of necks that are cut, cells: a rod with them cannot be simulated
+STUB = 1.5  # width of members that go where they end nowhere, cells
 UNIFORM = 1e-3  # range of a density without outline
 SMALLEST_STUB = 0.25  # area of a member that ends nowhere, at least, squared widths
 
@@ -209,7 +209,7 @@ def draw_outline(domain: Domain, limits: Limits) -> Outline:
     def excess(level: float) -> float:
         above = shapely.simplify(raster.above(level), CHORD * domain.cell)
         whole = shapely.union_all([above.intersection(limits.arm), stays])
-        result = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), level)
+        result = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), stays, level)
         tried.append(result)
         return 0.0 if result.off < AREA else result.area - volume
 
@@ -278,38 +278,40 @@ def _narrow(whole: Geometry, width: float, near: float) -> tuple[np.ndarray, np.
     return pieces, np.array(joined, dtype=int)
 
 
-def _at(domain: Domain, limits: Limits, whole: Geometry, level: float) -> Outline:
+def _at(domain: Domain, limits: Limits, whole: Geometry, stays: Geometry, level: float) -> Outline:
     """Return the outline at a level of what is above it."""
     import shapely
 
     before = polygons_of(whole)
     closed = shapely.union_all(before).buffer(limits.tool).buffer(-limits.tool)
     filled = shapely.union_all([*before, closed]).intersection(limits.arm)
-    narrow, joined = _narrow(filled, NECK * domain.cell, CHORD * domain.cell)
-    necks = shapely.union_all(narrow[joined != 1])  # a corner joins one wider piece
-    parts = polygons_of(filled.difference(necks))
-    near, ends = 1e-6 * domain.extent, _interfaces(domain)
-    whole = [p for p in parts if all(p.distance(end) < near for end in ends)]
+    near = CHORD * domain.cell
+    narrow, joined = _narrow(filled, LINK * domain.cell, near)
+    necks = shapely.buffer(narrow[joined > 1], 0.5 * LINK * domain.cell)
+    widened = shapely.union_all([filled, *necks]).intersection(limits.arm)
+    parts, ends = polygons_of(widened), _interfaces(domain)
+    touch = 1e-6 * domain.extent
+    whole = [p for p in parts if all(p.distance(end) < touch for end in ends)]
     main = max(whole, key=lambda p: p.area, default=shapely.Polygon())
     dropped = [p for p in parts if p is not main]
     holes = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in parts)
     area = float(sum(p.area for p in dropped))
+    main = _without_stubs(main, stays, STUB * domain.cell, near)
     return Outline(domain, main, level, limits.tool, len(dropped), area, max(holes, 0))
 
 
-def without_stubs(outline: Outline, limits: Limits, width: float) -> Outline:
-    """Return an outline without members narrower than `width`, m, that end nowhere.
+def _without_stubs(polygon: Polygon, stays: Geometry, width: float, near: float) -> Polygon:
+    """Return a polygon without members narrower than `width`, m, that end nowhere.
 
     A narrow piece stays where it joins two places of what is wider, or lies in what must stay.
     """
     import shapely
 
-    polygon = outline.polygon
-    stays = _stays(outline.domain, limits).intersection(polygon)
-    while True:
-        narrow, joined = _narrow(polygon, width, outline.chord)
+    while not polygon.is_empty:
+        narrow, joined = _narrow(polygon, width, near)
         stubs = narrow[(joined == 1) & (shapely.area(narrow) > SMALLEST_STUB * width**2)]
-        left = polygons_of(polygon.difference(shapely.union_all(stubs)).union(stays))
-        before, polygon = polygon.area, max(left, key=lambda item: item.area)
+        left = polygon.difference(shapely.union_all(stubs)).union(stays.intersection(polygon))
+        before, polygon = polygon.area, max(polygons_of(left), key=lambda item: item.area)
         if polygon.area > before - SMALLEST_STUB * width**2:
-            return replace(outline, polygon=polygon)
+            break
+    return polygon

@@ -41,7 +41,7 @@ TOLD = 5  # tight places that a sentence names
 ENOUGH = 0.98  # of the tool's radius, below which it does not reach a place
 SAME_AREA, QUARTERS = 1e-4, 6  # relative, of chords to their curves; of the chords' distance
 TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
-AWAY = 0.5  # cells that sides may lie from the outline by default
+AWAY = 1.0  # cells that sides may lie from the outline by default
 
 
 @dataclass(frozen=True, eq=False)
