@@ -77,9 +77,7 @@ class Run:
     edge: int  # number of the curve among `Domain.edges`; -1: free; their number: the axis
 
 
-def fitted_sides(
-    outline: Outline, limits: Limits, tolerance: float, area: float, hole: float | None = None
-) -> Sides:
+def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides:
     """Return the sides along an outline.
 
     Args:
@@ -87,13 +85,12 @@ def fitted_sides(
         limits: of the part.
         tolerance: how far they may lie from the polygon, m.
         area: to be enclosed, m2; missed where limits ask for more.
-        hole: area of the smallest hole that is drawn, m2; by default that of the tool's circle.
 
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
     pen = _Pen(outline, limits, counting())
-    contours = list(_contours(outline, tolerance, np.pi * limits.tool**2 if hole is None else hole))
+    contours = list(_contours(outline, tolerance, np.pi * limits.tool**2))
     drawn = {k: pen.drawn(item, tolerance) for k, item in enumerate(contours)}
     for halvings in range(1, FINER + 1):
         for k in _spoilt(drawn, contours, outline, tolerance):

@@ -159,23 +159,19 @@ class Outline:
         """Distance of its sides from the arm's own curves, m."""
         return CHORD * self.domain.cell
 
-    @property
-    def off(self) -> float:
-        """By how much the area differs from the design's volume, relative."""
-        return abs(self.area / self.domain.volume - 1.0)
-
 
 def default_tool(domain: Domain) -> float:
     """Return the tool's radius where none is asked for, m."""
     return min(TOOL, SLIM * domain.height)
 
 
-def draw_outline(domain: Domain, limits: Limits) -> Outline:
+def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
     """Find the outline whose area is the material's volume over the thickness.
 
     Args:
         domain: the arm.
         limits: of its part.
+        more: times that volume.
 
     Raises:
         InputError: the tool does not fit into the arm; the design is a checkerboard; no material
@@ -183,7 +179,7 @@ def draw_outline(domain: Domain, limits: Limits) -> Outline:
     """
     import shapely
 
-    where, tool, volume = f"arm {domain.name!r}", limits.tool, domain.volume
+    where, tool, volume = f"arm {domain.name!r}", limits.tool, more * domain.volume
     if 2.0 * tool >= domain.height:
         raise InputError(
             f"--tool-radius = {tool:g} m: the tool is as wide as {where}, which is "
@@ -211,14 +207,17 @@ def draw_outline(domain: Domain, limits: Limits) -> Outline:
         whole = shapely.union_all([above.intersection(limits.arm), stays])
         result = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), stays, level)
         tried.append(result)
-        return 0.0 if result.off < AREA else result.area - volume
+        return 0.0 if off(result) < AREA else result.area - volume
+
+    def off(outline: Outline) -> float:
+        return abs(outline.area / volume - 1.0)
 
     low, high = float(raster.values.min()), float(raster.values.max())
     step = 0.02 * (high - low)
     with suppress(ValueError):  # whatever the level the area is too large, or too small
         brentq(excess, low - step, high + step, xtol=AREA * (high - low))
-    result = min(tried, key=lambda item: item.off)
-    if result.off <= LEAP:
+    result = min(tried, key=off)
+    if off(result) <= LEAP:
         return result
     raise InputError(
         f"{where}: the material of the design does not hang together: at no level has the "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -236,6 +236,15 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
     if curves.rounds:
         sides = rounded_radii(sides, limits)
     return PlanePart(domain, outline, sides, fine)
+
+
+def fuller(part: PlanePart, more: float) -> PlanePart:
+    """Return the part of the contour of its densities that encloses so many times their volume."""
+    domain, tool = part.domain, part.outline.tool_radius
+    limits = limits_of_part(domain, tool)
+    outline = draw_outline(domain, limits, more)
+    sides = fitted_sides(outline, limits, AWAY * domain.cell, outline.area)
+    return replace(part, outline=outline, sides=sides)
 
 
 def _count(number: int, name: str) -> str:
