@@ -37,9 +37,9 @@ from dolfinopt.part.plane.sides import (
     unit,
 )
 
-LEAST = 0.5  # length of a side that is worth drawing, cells
+LEAST = 0.4  # length of a side that is worth drawing, cells
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
-FINER = 4  # times that the tolerance of a contour is halved
+FINER = 4  # times that a tolerance is halved: of a contour, and then of all
 REACH = 3.0  # cells from the ends of two sides within which they meet
 STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
 ROOM = 0.5  # share of a side that a fillet at one of its ends may take
@@ -89,21 +89,27 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
+    for halvings in range(FINER):
+        whole = _drawn(outline, limits, 0.5**halvings * tolerance)
+        with suppress(BrokenError):
+            made = limits.nearest(whole, area=area) or limits.nearest(whole)
+            if made is not None:
+                return made[0]
+    raise InputError(
+        f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
+        "the outline; choose another --tolerance or a smaller --tool-radius"
+    )
+
+
+def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
+    """Return the sides of all contours; finer ones of those that a tolerance spoils."""
     pen = _Pen(outline, limits, counting())
     contours = list(_contours(outline, tolerance, np.pi * limits.tool**2))
     drawn = {k: pen.drawn(item, tolerance) for k, item in enumerate(contours)}
     for halvings in range(1, FINER + 1):
         for k in _spoilt(drawn, contours, outline, tolerance):
             drawn[k] = pen.drawn(contours[k], 0.5**halvings * tolerance) or drawn[k]
-    whole = _joined(drawn.values())
-    with suppress(BrokenError):
-        made = limits.nearest(whole, area=area) or limits.nearest(whole)
-        if made is not None:
-            return made[0]
-    raise InputError(
-        f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
-        "the outline; choose another --tolerance or a smaller --tool-radius"
-    )
+    return _joined(drawn.values())
 
 
 def _spoilt(
@@ -115,7 +121,7 @@ def _spoilt(
     """Return which contours are not drawn, or too far from what is, or cross one another."""
     import shapely
 
-    near, rings, owners = set(), [], []
+    near, rings, owners = set(), list[shapely.LinearRing](), list[int]()
     for k, item in drawn.items():
         if item is None:
             continue

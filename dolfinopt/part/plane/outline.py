@@ -16,9 +16,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from dolfinopt.errors import InputError
-from dolfinopt.part.domain import INBOARD, OUTBOARD, Domain
-from dolfinopt.part.plane.curves import sampled
-from dolfinopt.part.plane.limits import CHORD, Limits
+from dolfinopt.part.domain import Domain
+from dolfinopt.part.plane.limits import CHORD, Limits, interfaces
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
@@ -33,8 +32,6 @@ BLUR = 0.6
 AREA = 1e-3  # relative: up to which the level is sought; sides make up for the rest
 LEAP = 0.05  # relative: what sides make up for where a piece joins or leaves at one level
 TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
-# Material along an interface that the design leaves void, in cells: the interface is rigid.
-STRIP = 0.5
 # Least width of members, in cells, also of those that the design has and the level has not: solid
 # cells that share a corner are joined in the finite elements. Without them a light arm has 12 holes
 # of 17, and the search from there ends 10 % heavier.
@@ -185,7 +182,7 @@ def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
             f"--tool-radius = {tool:g} m: the tool is as wide as {where}, which is "
             f"{domain.height:g} m high; expected less than {0.5 * domain.height:g} m"
         )
-    stays = _stays(domain, limits)
+    stays = limits.stays
     links = shapely.MultiLineString(list(domain.links)).buffer(0.5 * LINK * domain.cell)
     links = links.intersection(limits.arm)
     if stays.area > volume * (1.0 + AREA):
@@ -226,31 +223,6 @@ def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
     )
 
 
-def _interfaces(domain: Domain) -> list[Geometry]:
-    """Return the lines of both interfaces."""
-    import shapely
-
-    chord = CHORD * domain.cell
-    return [
-        shapely.union_all(
-            [
-                shapely.LineString(np.vstack([sampled([edge.curve], chord), edge.curve.end]))
-                for edge in domain.outline.edges
-                if edge.label == label
-            ]
-        )
-        for label in (INBOARD, OUTBOARD)
-    ]
-
-
-def _stays(domain: Domain, limits: Limits) -> Geometry:
-    """Return where material must be, strips along the interfaces among it."""
-    import shapely
-
-    strips = [interface.buffer(STRIP * domain.cell) for interface in _interfaces(domain)]
-    return shapely.union_all([limits.stays, *strips]).intersection(limits.arm)
-
-
 def _linked(whole: Geometry, links: Geometry, near: float) -> Geometry:
     """Return material with the links that join it in two places or more."""
     import shapely
@@ -288,7 +260,7 @@ def _at(domain: Domain, limits: Limits, whole: Geometry, stays: Geometry, level:
     narrow, joined = _narrow(filled, LINK * domain.cell, near)
     necks = shapely.buffer(narrow[joined > 1], 0.5 * LINK * domain.cell)
     widened = shapely.union_all([filled, *necks]).intersection(limits.arm)
-    parts, ends = polygons_of(widened), _interfaces(domain)
+    parts, ends = polygons_of(widened), interfaces(domain)
     touch = 1e-6 * domain.extent
     whole = [p for p in parts if all(p.distance(end) < touch for end in ends)]
     main = max(whole, key=lambda p: p.area, default=shapely.Polygon())
