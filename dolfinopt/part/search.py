@@ -35,7 +35,7 @@ DEAR, RESTORING, NEARBY = 50.0, 3, 0.1
 FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
 # Of the promised fall: what a step must bring, and what makes the next one shorter, or longer.
 ACCEPTED, POOR, GOOD = 0.05, 0.25, 0.6
-WORSE = 3e-3  # relative merit that a side or hole that goes may cost
+SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
 
 Tell = Callable[[str], None]
 
@@ -126,7 +126,7 @@ class Search:
             if self._step():
                 tell(self._line())
             elif self.since > 0:
-                self.since = FOLLOWED
+                self.since, self.radius = FOLLOWED, max(self.radius, NEARBY)
             elif not self._simplified():
                 return "no step betters the parts"
 
@@ -142,6 +142,8 @@ class Search:
 
     def _mesh_anew(self) -> None:
         """Go on with new meshes."""
+        if self.falls and len(self.falls) % SIMPLER == 0:
+            self._simplified()
         try:
             self.problem, self.state = self.problem.calibrated(self.state)
         except (ConvergenceError, InputError):  # sides that all but touch
@@ -149,7 +151,6 @@ class Search:
             self.problem, self.state = self.problem.calibrated(before)
             self.radius *= 0.5
         self.since, self.before, self.meshed = 0, None, self.state.outlines
-        self.radius = max(self.radius, NEARBY)
         value = self.state.values[0]
         self.falls.append(value + abs(value) * self.state.excess)
 

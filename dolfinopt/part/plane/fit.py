@@ -123,9 +123,10 @@ def _spoilt(
 
     near, rings, owners = set(), list[shapely.LinearRing](), list[int]()
     for k, item in drawn.items():
-        if item is None:
+        polygons = [] if item is None else item.shape.polygons(outline.chord)
+        if item is None or min(len(points) for points in polygons) < 3:
             continue
-        loops = [shapely.linearrings(points) for points in item.shape.polygons(outline.chord)]
+        loops = [shapely.linearrings(points) for points in polygons]
         missed = shapely.distance(shapely.points(contours[k].points), shapely.union_all(loops))
         if max(missed.max(), distance(item, outline)) <= tolerance:
             near.add(k)
