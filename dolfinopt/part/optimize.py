@@ -33,8 +33,8 @@ from dolfinopt.scene.load import Scene
 
 REPAIRS = 3  # times that limits missed in the end are met by further steps
 # Times the design's volume that contours enclose with which a search may begin. Struts that are
-# grey break at the contour of the volume: a rod misses its stress by 295 % there and its search ends
-# outside the limit; with a tenth more it is 71 %, and the search ends within.
+# grey break at the contour of the volume: a rod misses its stress by 295 % there and its search
+# ends outside the limit; with a tenth more it is 71 %, and the search ends within.
 MORE = (1.0, 1.1, 1.2)
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 

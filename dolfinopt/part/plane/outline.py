@@ -36,8 +36,8 @@ TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at
 # cells that share a corner are joined in the finite elements. Without them a light arm has 12 holes
 # of 17, and the search from there ends 10 % heavier.
 LINK = 0.5
-# Width of members that go where they end nowhere, cells: with neither this nor wider necks a rod has
-# no sides within a cell, and a plate with bores twice as many, 403 kB of STEP for 214.
+# Width of members that go where they end nowhere, cells: with neither this nor wider necks a rod
+# has no sides within a cell, and a plate with bores twice as many, 403 kB of STEP for 214.
 STUB = 1.5
 UNIFORM = 1e-3  # range of a density without outline
 SMALLEST_STUB = 0.25  # area of a member that ends nowhere, at least, squared widths
