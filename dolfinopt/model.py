@@ -591,7 +591,7 @@ class Model:
             tool_radius: least of concave corners, m; None: the scene's, or 3 mm. Like the next, of
                 solids for those alone whose design is the same over the thickness.
             tolerance: how far sides may lie from the densities' outline, m; None: the scene's, or
-                half a cell.
+                a cell.
             optimize: whether to optimise the parts' shape; None: as the scene's [part] says.
 
         Returns:

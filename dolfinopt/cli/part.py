@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     "--tolerance",
     type=float,
     metavar="M",
-    help="how far sides may lie from the outline of the densities; default: half a cell",
+    help="how far sides may lie from the outline of the densities; default: a cell",
 )
 @click.option("--curves", hidden=True, expose_value=False)  # of splines: no effect
 @click.option("--simplify/--no-simplify", hidden=True, expose_value=False)  # no effect

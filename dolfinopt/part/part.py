@@ -32,7 +32,7 @@ class Curves:
 
     Attributes:
         tool_radius: least of concave corners, m; None: 3 mm.
-        tolerance: how far sides may lie from the densities' outline, m; None: half a cell.
+        tolerance: how far sides may lie from the densities' outline, m; None: a cell.
         rounds: whether radii are whole half millimetres.
     """
 

@@ -72,6 +72,11 @@ class State:
         objective = sign * self.simulated.evaluation.objective
         return np.concatenate([[objective], self.smooth / held - 1.0, self.shares])
 
+    def cost(self, price: float) -> float:
+        """Return what is minimised and the price of missed limits, a multiple of its size."""
+        value, *limits = self.values
+        return float(value + price * abs(value) * np.maximum(limits, 0.0).sum())
+
     @property
     def excess(self) -> float:
         """The largest relative violation of a limit, 0 where all are met."""

@@ -88,7 +88,8 @@ def test_openings_are_rounded_by_the_tool_alone(design):
     x0, y0, x1, y1 = hole.bounds
     assert (x1 - x0, y1 - y0) == pytest.approx((0.045, 0.028), abs=5e-4)
     rounding = (x1 - x0) * (y1 - y0) - hole.area
-    assert 0.8 * (4.0 - np.pi) * 0.003**2 < rounding < 3.0 * (4.0 - np.pi) * 0.003**2
+    # Sides lie up to a cell, 2.5 mm, off the outline: 3.4 times, where half a cell gives below 3.
+    assert 0.8 * (4.0 - np.pi) * 0.003**2 < rounding < 3.5 * (4.0 - np.pi) * 0.003**2
 
 
 def square(side, notch=None):

@@ -9,7 +9,8 @@ Source: Douglas & Peucker (1973), doi:10.3138/FM57-6770-U75U-7727.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import count as counting
 from itertools import pairwise
@@ -21,7 +22,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Edge
 from dolfinopt.part.plane.curves import MIRROR, Arc, Curve, Line, Piece, circle_through
 from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, SHORT, TURN, Limits
-from dolfinopt.part.plane.outline import AREA, Outline
+from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.sides import (
     BrokenError,
     Circle,
@@ -36,16 +37,12 @@ from dolfinopt.part.plane.sides import (
     unit,
 )
 
-MIDDLE = 0.7  # share of a portion that its line is fitted to
-LEAST = 0.3  # length of a side that is worth drawing, cells
-SPIKE = np.radians(150.0)  # turn between two lines that end a strut nowhere
+LEAST = 0.4  # length of a side that is worth drawing, cells
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
-ATTEMPTS, COARSER = (1.0, 0.6, 0.35), (0.2, 2.0, 4.0)  # shares of the tolerance, tried in turn
-THIN = 0.1  # least width of members, cells, where there are no sides with those asked for
+FINER = 4  # times that a tolerance is halved: of a contour, and then of all
 REACH = 3.0  # cells from the ends of two sides within which they meet
-CORNER = np.radians(140.0)  # turn of a corner in place of a side, at most
 STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
-ROOM = 0.45  # share of a side that a fillet at one of its ends may take
+ROOM = 0.5  # share of a side that a fillet at one of its ends may take
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +69,6 @@ class Drawn:
         return replace(self, side=replace(self.side, key=key, twin=twin))
 
 
-Gap = Callable[[np.ndarray], float]
-
-
 @dataclass(frozen=True, eq=False)
 class Run:
     """Points (n, 2), m, of the outline along one curve of the arm, or free."""
@@ -83,9 +77,7 @@ class Run:
     edge: int  # number of the curve among `Domain.edges`; -1: free; their number: the axis
 
 
-def fitted_sides(
-    outline: Outline, limits: Limits, tolerance: float, area: float, hole: float | None = None
-) -> Sides:
+def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float) -> Sides:
     """Return the sides along an outline.
 
     Args:
@@ -93,41 +85,64 @@ def fitted_sides(
         limits: of the part.
         tolerance: how far they may lie from the polygon, m.
         area: to be enclosed, m2; missed where limits ask for more.
-        hole: area of the smallest hole that is drawn, m2; by default that of the tool's circle.
 
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
-    least = np.pi * limits.tool**2 if hole is None else hole
-    thin = replace(limits, member=min(limits.member, THIN * limits.cell))
-    for kept, shares in ((limits, ATTEMPTS), (limits, COARSER), (thin, ATTEMPTS)):
-        result: list[tuple[bool, float, Sides]] = []
-        for share in shares:
-            made = _made(outline, kept, share * tolerance, area, least)
-            if made is None:
-                continue
-            off, far = abs(made.shape.area / area - 1.0) > AREA, distance(made, outline)
-            result.append((off, far, made))
-            if not off and far <= tolerance:
-                break
-        if result:  # what is thinner than asked for, or further off, is told
-            return min(result, key=lambda item: item[:2])[2]
+    for halvings in range(FINER):
+        whole = _drawn(outline, limits, 0.5**halvings * tolerance)
+        with suppress(BrokenError):
+            made = limits.nearest(whole, area=area) or limits.nearest(whole)
+            if made is not None:
+                return made[0]
     raise InputError(
         f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
         "the outline; choose another --tolerance or a smaller --tool-radius"
     )
 
 
-def _made(
-    outline: Outline, limits: Limits, tolerance: float, area: float, hole: float
-) -> Sides | None:
-    """Return sides along an outline that keep the limits; None: there are none."""
-    try:
-        drawn = _drawn(outline, limits, tolerance, hole)
-    except BrokenError:
-        return None
-    result = limits.nearest(drawn, area=area) or limits.nearest(drawn)
-    return None if result is None else result[0]
+def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
+    """Return the sides of all contours; finer ones of those that a tolerance spoils."""
+    pen = _Pen(outline, limits, counting())
+    contours = list(_contours(outline, tolerance, np.pi * limits.tool**2))
+    drawn = {k: pen.drawn(item, tolerance) for k, item in enumerate(contours)}
+    for halvings in range(1, FINER + 1):
+        for k in _spoilt(drawn, contours, outline, tolerance):
+            drawn[k] = pen.drawn(contours[k], 0.5**halvings * tolerance) or drawn[k]
+    return _joined(drawn.values())
+
+
+def _spoilt(
+    drawn: Mapping[int, Sides | None],
+    contours: Sequence[_Contour],
+    outline: Outline,
+    tolerance: float,
+) -> set[int]:
+    """Return which contours are not drawn, or too far from what is, or cross one another."""
+    import shapely
+
+    near, rings, owners = set(), list[shapely.LinearRing](), list[int]()
+    for k, item in drawn.items():
+        polygons = [] if item is None else item.shape.polygons(outline.chord)
+        if item is None or min(len(points) for points in polygons) < 3:
+            continue
+        loops = [shapely.linearrings(points) for points in polygons]
+        missed = shapely.distance(shapely.points(contours[k].points), shapely.union_all(loops))
+        if max(missed.max(), distance(item, outline)) <= tolerance:
+            near.add(k)
+            rings, owners = [*rings, *loops], [*owners, *[k] * len(loops)]
+    crossed = np.triu(shapely.intersects(np.array(rings)[:, None], rings), 1)
+    bad = crossed.any(axis=0) | crossed.any(axis=1) | ~shapely.is_simple(rings)
+    return set(drawn) - near | set(np.array(owners, dtype=int)[bad].tolist())
+
+
+def _joined(drawn: Iterable[Sides | None]) -> Sides:
+    """Return the sides of all contours together."""
+    known = [item for item in drawn if item is not None]
+    loops = sorted((loop for item in known for loop in item.loops), key=lambda loop: -loop.area)
+    circles = [circle for item in known for circle in item.circles]
+    fixed = [ring for item in known for ring in item.fixed]
+    return Sides(tuple(loops), tuple(circles), tuple(fixed))
 
 
 def distance(sides: Sides, outline: Outline) -> float:
@@ -217,59 +232,96 @@ def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarr
 # -- loops of sides -------------------------------------------------------------------------------
 
 
-def _drawn(outline: Outline, limits: Limits, tolerance: float, hole: float) -> Sides:
-    """Return sides along an outline before their limits are looked at; no smaller holes, m2."""
+@dataclass(frozen=True, eq=False)
+class _Contour:
+    """A closed part of an outline.
+
+    Attributes:
+        chain: its runs, one after the other.
+        halved: whether they are its upper half.
+        twins: whether it has a mirror image.
+    """
+
+    chain: Sequence[Run]
+    halved: bool
+    twins: bool
+
+    @property
+    def points(self) -> np.ndarray:
+        """(n, 2) m."""
+        return np.vstack([run.points for run in self.chain])
+
+    @property
+    def area(self) -> float:
+        """Area of the hole that it bounds where it is free, m2; infinite where it is not."""
+        if any(run.edge >= 0 for run in self.chain):
+            return float("inf")
+        x, y = self.points.T
+        return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) * (1.0 + self.halved)
+
+
+def _contours(outline: Outline, tolerance: float, hole: float) -> Iterator[_Contour]:
+    """Yield the contours of an outline, but for smaller holes, m2."""
     import shapely
 
-    domain, names = outline.domain, counting()
-    edges, curves = domain.edges, [edge.curve for edge in domain.edges]
+    domain = outline.domain
+    curves = [edge.curve for edge in domain.edges]
     if domain.symmetric:
         wide = np.array([4.0 * domain.extent, 0.0])
         curves = [*curves, Line(-wide, wide)]
     lines = [
         shapely.LineString(np.vstack([c.at(c.parameters(outline.chord)), c.end])) for c in curves
     ]
-    outer, boundary = domain.outer_edges, outline.polygon.boundary
-
-    def gap(place: np.ndarray) -> float:
-        return float(shapely.distance(shapely.Point(place), boundary))
-
-    def as_wide(_: int, place: np.ndarray, half: float) -> float:
-        """Return the radius of a fillet that touches the outline."""
-        return gap(place) / (1.0 / np.cos(half) - 1.0)
-
-    loops: list[Loop] = []
-    circles: list[Circle] = []
-    fixed: list[tuple[Piece, ...]] = []
     for ring in _rings(outline):
         runs = _runs(ring, lines, outline.chord, tolerance)
-        for chain, halved in _chains(runs, len(edges) if domain.symmetric else -2):
-            if _hole_area(chain, halved) < hole:
-                continue
-            twins = domain.symmetric and not halved
-            if (circle := _free_circle(chain, halved, tolerance)) is not None:
-                circles += _named_circles(circle, twins, halved, names)
-                continue
-            closed = len(chain) == 1 and not halved
-            drawn = [item for run in chain for item in _sides_along(run, edges, tolerance, closed)]
-            drawn = _distinct([item.named(key=next(names)) for item in drawn], halved)
-            drawn = _whole(drawn, names) if halved else drawn
-            drawn = cornered(cleaned(drawn, limits), limits, gap, tolerance)
-            if not drawn:
-                continue
-            if _is_circle(drawn):
-                curve = drawn[0].side.curve
-                assert curve is not None
-                piece = Piece(curve, drawn[0].side.label)
-                fixed += [(item,) for item in ([piece, _mirrored(piece)] if twins else [piece])]
-                continue
-            pair = [drawn]
-            if twins:
-                pair[0] = [item.named(twin=next(names)) for item in drawn]
-                pair.append([item.mirrored() for item in reversed(pair[0])])
-            loops += [looped(some, limits, outer, as_wide) for some in pair]
-    loops.sort(key=lambda loop: -loop.area)
-    return Sides(tuple(loops), tuple(circles), tuple(fixed)).centred()
+        for chain, halved in _chains(runs, len(domain.edges) if domain.symmetric else -2):
+            result = _Contour(chain, halved, domain.symmetric and not halved)
+            if result.area >= hole:
+                yield result
+
+
+@dataclass(frozen=True, eq=False)
+class _Pen:
+    """What draws contours of an outline within limits; `names` are those of its sides."""
+
+    outline: Outline
+    limits: Limits
+    names: Iterator[int]
+
+    def radius(self, _: int, place: np.ndarray, half: float) -> float:
+        """Return the radius of a fillet that touches the outline."""
+        import shapely
+
+        gap = shapely.distance(shapely.Point(place), self.outline.polygon.boundary)
+        return float(gap / (1.0 / np.cos(half) - 1.0))
+
+    def drawn(self, contour: _Contour, tolerance: float) -> Sides | None:
+        """Return the sides along a contour; None where they do not close."""
+        chain, halved, twins, names = contour.chain, contour.halved, contour.twins, self.names
+        if (circle := _free_circle(chain, halved, tolerance)) is not None:
+            return Sides((), tuple(_named_circles(circle, twins, halved, names)))
+        edges, outer = self.outline.domain.edges, self.outline.domain.outer_edges
+        closed = len(chain) == 1 and not halved
+        drawn = [item for run in chain for item in _sides_along(run, edges, tolerance, closed)]
+        drawn = _distinct([item.named(key=next(names)) for item in drawn], halved)
+        drawn = _whole(drawn, names) if halved else drawn
+        drawn = cleaned(drawn, self.limits)
+        if not drawn:
+            return None
+        if _is_circle(drawn):
+            curve = drawn[0].side.curve
+            assert curve is not None
+            piece = Piece(curve, drawn[0].side.label)
+            return Sides((), (), ((piece,), (_mirrored(piece),)) if twins else ((piece,),))
+        pair = [drawn]
+        if twins:
+            pair[0] = [item.named(twin=next(names)) for item in drawn]
+            pair.append([item.mirrored() for item in reversed(pair[0])])
+        try:
+            loops = [looped(some, self.limits, outer, self.radius) for some in pair]
+            return Sides(tuple(loops)).centred()
+        except BrokenError:
+            return None
 
 
 def _chains(runs: list[Run], axis: int) -> Iterator[tuple[list[Run], bool]]:
@@ -281,14 +333,6 @@ def _chains(runs: list[Run], axis: int) -> Iterator[tuple[list[Run], bool]]:
     for a, b in pairwise([*cuts, cuts[0] + len(runs)]):
         if chain := [runs[k % len(runs)] for k in range(a + 1, b)]:
             yield chain, True
-
-
-def _hole_area(chain: Sequence[Run], halved: bool) -> float:
-    """Return the area of the hole that a free chain bounds, m2; infinite where it is not free."""
-    if any(run.edge >= 0 for run in chain):
-        return float("inf")
-    x, y = np.vstack([run.points for run in chain]).T
-    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) * (1.0 + halved)
 
 
 def _is_circle(drawn: Sequence[Drawn]) -> bool:
@@ -362,8 +406,7 @@ def _straight(points: np.ndarray, tolerance: float, closed: bool) -> list[Drawn]
     at = [passed[np.argmin(np.linalg.norm(points[:last] - c, axis=1))] for c in corners[:-1]]
     result = []
     for (a, b), ends in zip(pairwise([*at, passed[-1]]), pairwise(corners), strict=True):
-        cut = 0.5 * (1.0 - MIDDLE) * (b - a)
-        p = shapely.get_coordinates(line.interpolate(np.linspace(a + cut, b - cut, 40)))
+        p = shapely.get_coordinates(line.interpolate(np.linspace(a, b, 40)))
         middle = p.mean(axis=0)
         d = np.linalg.svd(p - middle)[2][0]
         d = d if d @ (p[-1] - p[0]) > 0.0 else -d
@@ -472,53 +515,6 @@ def cleaned(drawn: Sequence[Drawn], limits: Limits) -> list[Drawn]:
     return []
 
 
-def cornered(drawn: list[Drawn], limits: Limits, gap: Gap, tolerance: float) -> list[Drawn]:
-    """Return sides without short ones in whose place a corner of their neighbours will do.
-
-    Args:
-        drawn: the sides of a loop.
-        limits: of the part.
-        gap: distance of a place from the outline, m.
-        tolerance: distance from it up to which a sharp corner will do, m.
-    """
-    for item in sorted(drawn, key=lambda entry: float(np.linalg.norm(entry.end - entry.start))):
-        names = [other.names for other in drawn]
-        if item.names in names and item.side.free and len(drawn) > 2 + len(item.names):
-            if _corner_will_do(drawn, names.index(item.names), limits, gap, tolerance):
-                left = cleaned([other for other in drawn if not other.names & item.names], limits)
-                drawn = left or drawn
-    return drawn
-
-
-def _corner_will_do(
-    drawn: Sequence[Drawn], k: int, limits: Limits, gap: Gap, tolerance: float
-) -> bool:
-    """Return whether the sides beside side k meet near the outline, with a fillet that fits."""
-    before, one, after = drawn[k - 1], drawn[k], drawn[(k + 1) % len(drawn)]
-    if one.side.key == one.side.twin and not {before.side.key, after.side.key} - one.names:
-        return False
-    try:
-        place = meet(before.side, after.side, 0.0, 0.5 * (one.start + one.end))
-    except BrokenError:
-        return False
-    a, b = before.side.foot(place)[1], after.side.foot(place)[1]
-    turn = turn_between(a, b)
-    ends = np.linalg.norm(one.start - place), np.linalg.norm(one.end - place)
-    if abs(turn) > CORNER or max(ends) > REACH * limits.cell:
-        return False
-    if turn > 0.0:
-        return gap(place) <= tolerance
-    half = float(np.clip(-turn / 2.0, 0.5 * TURN, STEEP))
-    radius = max(gap(place) / (1.0 / np.cos(half) - 1.0), limits.tool)
-    room = min(np.linalg.norm(place - before.start), np.linalg.norm(after.end - place))
-    if radius * np.tan(half) > ROOM * room:
-        return False
-    out = -left(a) - left(b)
-    centre = place + radius / np.cos(half) * out / np.linalg.norm(out)
-    arc = Arc(centre, radius, angle_of(left(a)), turn).at(np.linspace(0.0, 1.0, 7))
-    return max(map(gap, arc)) <= tolerance
-
-
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
     """Return the number of the side to leave out, and whether the one before takes its place."""
     places, turns = _vertices(drawn, REACH * limits.cell)
@@ -533,10 +529,9 @@ def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
         room = float(step @ unit(item.side.angle) if item.side.free else np.linalg.norm(step))
         room -= need[k] + need[j] + LEAST * limits.cell
         meets = not np.isnan([turns[k], turns[j]]).any()
-        is_end = any(turns[i] > SPIKE for i in (k, j))  # of a strut that ends nowhere
         both = before.free and item.side.free and item.side.twin != before.key
         straight = both and abs(turns[k]) < 2.0 * TURN
-        if room >= 0.0 and meets and not is_end and not straight:
+        if room >= 0.0 and meets and not straight:
             continue
         # The shortest one: where two sides do not meet well, a long one looks turned round.
         size = 0.0 if straight else float(np.linalg.norm(item.end - item.start))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -32,7 +32,6 @@ from dolfinopt.part.solid.part import SolidPart, plate_part
 # Shape of a triangle, 1 where it is equilateral, below which a new mesh is due, and over the worst.
 WORN, WORSE = 0.12, 0.7
 Mesh = BodyMesh | Tetrahedra  # of a plate in space a `PlateMesh`
-Fewer = Callable[[Sides, Limits, int], Iterator[Sides]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,15 +81,11 @@ class FreeSides:
         """Return what must not be positive (m,), m, and its derivatives (m, count)."""
         return self.limits.rows(self.sides)
 
-    def simplified(self, fewer: Fewer = simplifications) -> tuple[FreeSides, int]:
-        """Return it without what its limits hold at its least, and how many such things went.
-
-        Args:
-            fewer: yields outlines without one of such things.
-        """
+    def simplified(self) -> tuple[FreeSides, int]:
+        """Return it without what its limits hold at its least, and how many such things went."""
         made, number = self, 0
         while True:
-            for sides in fewer(made.sides, self.limits, self.part.domain.outer_edges):
+            for sides in simplifications(made.sides, self.limits, self.part.domain.outer_edges):
                 result = replace(made, sides=sides).nearest()
                 if result is not None and result[0].count < made.count:
                     made, number = result[0], number + 1

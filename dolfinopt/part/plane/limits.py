@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from dolfinopt.part.domain import Domain
+from dolfinopt.part.domain import INBOARD, OUTBOARD, Domain
 from dolfinopt.part.plane.curves import (
     GAUSS,
     WEIGHTS,
@@ -27,6 +27,7 @@ from dolfinopt.part.plane.curves import (
     Spline,
     curvature,
     direction,
+    sampled,
 )
 from dolfinopt.part.plane.sides import (
     ArcMoves,
@@ -54,6 +55,8 @@ NEAR = 2.0  # least widths: distance up to which two pieces are looked at
 HALF = 5e-4  # m, of which rounded radii are multiples
 CHORD = 0.005  # distance of polygons from curves, cells
 EXACTLY = 0.01  # of it, up to which an area may be, over the slope
+# Material along an interface, in cells, also where the design leaves it void: interfaces are rigid.
+STRIP = 0.5
 KEPT = 2e-6  # m, up to which a limit may be missed
 FARTHEST = 0.5  # cells that a side moves in a step to the nearest outline
 STEPS = 20  # of them, at most
@@ -206,6 +209,23 @@ class Limits:
         return sides.shape.is_simple(CHORD * self.cell)
 
 
+def interfaces(domain: Domain) -> list[Geometry]:
+    """Return the lines of both interfaces."""
+    import shapely
+
+    chord = CHORD * domain.cell
+    return [
+        shapely.union_all(
+            [
+                shapely.LineString(np.vstack([sampled([edge.curve], chord), edge.curve.end]))
+                for edge in domain.outline.edges
+                if edge.label == label
+            ]
+        )
+        for label in (INBOARD, OUTBOARD)
+    ]
+
+
 def limits_of_part(
     domain: Domain, tool: float, minimum_gap: float = 0.0, scale: float = 1.0
 ) -> Limits:
@@ -217,9 +237,12 @@ def limits_of_part(
         minimum_gap: least width of gaps, m; they are as wide as the tool whatever it is.
         scale: least factor by which arms that repeat this one's design are smaller than it.
     """
+    import shapely
+
     chord = CHORD * domain.cell
     arm = domain.outline.area_inside(chord).difference(domain.void.area_inside(chord))
-    stays = domain.solid.area_inside(chord).intersection(arm)
+    strips = [interface.buffer(STRIP * domain.cell) for interface in interfaces(domain)]
+    stays = shapely.union_all([domain.solid.area_inside(chord), *strips]).intersection(arm)
     member = (domain.minimum_member or THIN) / scale
     return Limits(domain.cell, tool, member, max(2.0 * tool, minimum_gap) / scale, arm, stays)
 

@@ -8,7 +8,7 @@ tool.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +16,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from dolfinopt.errors import InputError
-from dolfinopt.part.domain import INBOARD, OUTBOARD, Domain
-from dolfinopt.part.plane.curves import sampled
-from dolfinopt.part.plane.limits import CHORD, Limits
+from dolfinopt.part.domain import Domain
+from dolfinopt.part.plane.limits import CHORD, Limits, interfaces
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
@@ -33,13 +32,13 @@ BLUR = 0.6
 AREA = 1e-3  # relative: up to which the level is sought; sides make up for the rest
 LEAP = 0.05  # relative: what sides make up for where a piece joins or leaves at one level
 TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
-# Material along an interface that the design leaves void, in cells: the interface is rigid.
-STRIP = 0.5
-# Width of members that the design has and the level has not, in cells: solid cells that share a
-# corner are joined in the finite elements. Without them a light arm has 12 holes of 17, and the
-# search from there ends 10 % heavier.
+# Least width of members, in cells, also of those that the design has and the level has not: solid
+# cells that share a corner are joined in the finite elements. Without them a light arm has 12 holes
+# of 17, and the search from there ends 10 % heavier.
 LINK = 0.5
-NECK = 0.3  # width of necks that are cut, cells: a rod with them cannot be simulated
+# Width of members that go where they end nowhere, cells: with neither this nor wider necks a rod
+# has no sides within a cell, and a plate with bores twice as many, 403 kB of STEP for 214.
+STUB = 1.5
 UNIFORM = 1e-3  # range of a density without outline
 SMALLEST_STUB = 0.25  # area of a member that ends nowhere, at least, squared widths
 
@@ -159,23 +158,19 @@ class Outline:
         """Distance of its sides from the arm's own curves, m."""
         return CHORD * self.domain.cell
 
-    @property
-    def off(self) -> float:
-        """By how much the area differs from the design's volume, relative."""
-        return abs(self.area / self.domain.volume - 1.0)
-
 
 def default_tool(domain: Domain) -> float:
     """Return the tool's radius where none is asked for, m."""
     return min(TOOL, SLIM * domain.height)
 
 
-def draw_outline(domain: Domain, limits: Limits) -> Outline:
+def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
     """Find the outline whose area is the material's volume over the thickness.
 
     Args:
         domain: the arm.
         limits: of its part.
+        more: times that volume.
 
     Raises:
         InputError: the tool does not fit into the arm; the design is a checkerboard; no material
@@ -183,13 +178,13 @@ def draw_outline(domain: Domain, limits: Limits) -> Outline:
     """
     import shapely
 
-    where, tool, volume = f"arm {domain.name!r}", limits.tool, domain.volume
+    where, tool, volume = f"arm {domain.name!r}", limits.tool, more * domain.volume
     if 2.0 * tool >= domain.height:
         raise InputError(
             f"--tool-radius = {tool:g} m: the tool is as wide as {where}, which is "
             f"{domain.height:g} m high; expected less than {0.5 * domain.height:g} m"
         )
-    stays = _stays(domain, limits)
+    stays = limits.stays
     links = shapely.MultiLineString(list(domain.links)).buffer(0.5 * LINK * domain.cell)
     links = links.intersection(limits.arm)
     if stays.area > volume * (1.0 + AREA):
@@ -209,47 +204,25 @@ def draw_outline(domain: Domain, limits: Limits) -> Outline:
     def excess(level: float) -> float:
         above = shapely.simplify(raster.above(level), CHORD * domain.cell)
         whole = shapely.union_all([above.intersection(limits.arm), stays])
-        result = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), level)
+        result = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), stays, level)
         tried.append(result)
-        return 0.0 if result.off < AREA else result.area - volume
+        return 0.0 if off(result) < AREA else result.area - volume
+
+    def off(outline: Outline) -> float:
+        return abs(outline.area / volume - 1.0)
 
     low, high = float(raster.values.min()), float(raster.values.max())
     step = 0.02 * (high - low)
     with suppress(ValueError):  # whatever the level the area is too large, or too small
         brentq(excess, low - step, high + step, xtol=AREA * (high - low))
-    result = min(tried, key=lambda item: item.off)
-    if result.off <= LEAP:
+    result = min(tried, key=off)
+    if off(result) <= LEAP:
         return result
     raise InputError(
         f"{where}: the material of the design does not hang together: at no level has the "
         "piece that joins both interfaces the design's volume; let the optimisation go on "
         "until the design is crisp (design.projection)"
     )
-
-
-def _interfaces(domain: Domain) -> list[Geometry]:
-    """Return the lines of both interfaces."""
-    import shapely
-
-    chord = CHORD * domain.cell
-    return [
-        shapely.union_all(
-            [
-                shapely.LineString(np.vstack([sampled([edge.curve], chord), edge.curve.end]))
-                for edge in domain.outline.edges
-                if edge.label == label
-            ]
-        )
-        for label in (INBOARD, OUTBOARD)
-    ]
-
-
-def _stays(domain: Domain, limits: Limits) -> Geometry:
-    """Return where material must be, strips along the interfaces among it."""
-    import shapely
-
-    strips = [interface.buffer(STRIP * domain.cell) for interface in _interfaces(domain)]
-    return shapely.union_all([limits.stays, *strips]).intersection(limits.arm)
 
 
 def _linked(whole: Geometry, links: Geometry, near: float) -> Geometry:
@@ -278,38 +251,40 @@ def _narrow(whole: Geometry, width: float, near: float) -> tuple[np.ndarray, np.
     return pieces, np.array(joined, dtype=int)
 
 
-def _at(domain: Domain, limits: Limits, whole: Geometry, level: float) -> Outline:
+def _at(domain: Domain, limits: Limits, whole: Geometry, stays: Geometry, level: float) -> Outline:
     """Return the outline at a level of what is above it."""
     import shapely
 
     before = polygons_of(whole)
     closed = shapely.union_all(before).buffer(limits.tool).buffer(-limits.tool)
     filled = shapely.union_all([*before, closed]).intersection(limits.arm)
-    narrow, joined = _narrow(filled, NECK * domain.cell, CHORD * domain.cell)
-    necks = shapely.union_all(narrow[joined != 1])  # a corner joins one wider piece
-    parts = polygons_of(filled.difference(necks))
-    near, ends = 1e-6 * domain.extent, _interfaces(domain)
-    whole = [p for p in parts if all(p.distance(end) < near for end in ends)]
+    near = CHORD * domain.cell
+    narrow, joined = _narrow(filled, LINK * domain.cell, near)
+    necks = shapely.buffer(narrow[joined > 1], 0.5 * LINK * domain.cell)
+    widened = shapely.union_all([filled, *necks]).intersection(limits.arm)
+    parts, ends = polygons_of(widened), interfaces(domain)
+    touch = 1e-6 * domain.extent
+    whole = [p for p in parts if all(p.distance(end) < touch for end in ends)]
     main = max(whole, key=lambda p: p.area, default=shapely.Polygon())
     dropped = [p for p in parts if p is not main]
     holes = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in parts)
     area = float(sum(p.area for p in dropped))
+    main = _without_stubs(main, stays, STUB * domain.cell, near)
     return Outline(domain, main, level, limits.tool, len(dropped), area, max(holes, 0))
 
 
-def without_stubs(outline: Outline, limits: Limits, width: float) -> Outline:
-    """Return an outline without members narrower than `width`, m, that end nowhere.
+def _without_stubs(polygon: Polygon, stays: Geometry, width: float, near: float) -> Polygon:
+    """Return a polygon without members narrower than `width`, m, that end nowhere.
 
     A narrow piece stays where it joins two places of what is wider, or lies in what must stay.
     """
     import shapely
 
-    polygon = outline.polygon
-    stays = _stays(outline.domain, limits).intersection(polygon)
-    while True:
-        narrow, joined = _narrow(polygon, width, outline.chord)
+    while not polygon.is_empty:
+        narrow, joined = _narrow(polygon, width, near)
         stubs = narrow[(joined == 1) & (shapely.area(narrow) > SMALLEST_STUB * width**2)]
-        left = polygons_of(polygon.difference(shapely.union_all(stubs)).union(stays))
-        before, polygon = polygon.area, max(left, key=lambda item: item.area)
+        left = polygon.difference(shapely.union_all(stubs)).union(stays.intersection(polygon))
+        before, polygon = polygon.area, max(polygons_of(left), key=lambda item: item.area)
         if polygon.area > before - SMALLEST_STUB * width**2:
-            return replace(outline, polygon=polygon)
+            break
+    return polygon

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -41,7 +41,7 @@ TOLD = 5  # tight places that a sentence names
 ENOUGH = 0.98  # of the tool's radius, below which it does not reach a place
 SAME_AREA, QUARTERS = 1e-4, 6  # relative, of chords to their curves; of the chords' distance
 TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
-AWAY = 0.5  # cells that sides may lie from the outline by default
+AWAY = 1.0  # cells that sides may lie from the outline by default
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,6 +236,15 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
     if curves.rounds:
         sides = rounded_radii(sides, limits)
     return PlanePart(domain, outline, sides, fine)
+
+
+def fuller(part: PlanePart, more: float) -> PlanePart:
+    """Return the part of the contour of its densities that encloses so many times their volume."""
+    domain, tool = part.domain, part.outline.tool_radius
+    limits = limits_of_part(domain, tool)
+    outline = draw_outline(domain, limits, more)
+    sides = fitted_sides(outline, limits, AWAY * domain.cell, outline.area)
+    return replace(part, outline=outline, sides=sides)
 
 
 def _count(number: int, name: str) -> str:

@@ -478,7 +478,7 @@ class Part(Table):
         None, "least radius of concave corners; default: 0.003 [m]", ge=0, le=1e4
     )
     tolerance: Length | None = setting(
-        None, "how far sides may lie from the outline of the densities; default: half a cell [m]"
+        None, "how far sides may lie from the outline of the densities; default: a cell [m]"
     )
     minimum_member: Length | None = setting(
         None, "smallest width of members of a part; default: design.minimum_member, or 0.001 [m]"
