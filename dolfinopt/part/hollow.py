@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from dolfinopt.mesh.arm_mesh import ArmMesh
 
 
+CORNER_STEP = 1.2  # thickness of a wall over that of its corner, at most; from 1.25 cells fold
 VERTICES = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)])
 
 
@@ -200,9 +201,21 @@ def make_hollow_part(mesh: ArmMesh, x_phys: np.ndarray, curves: Curves = DEFAULT
         )
     assert mesh.wall is not None
     wall = mesh.wall
-    thickness = wall.thickness(mesh.comm, x_phys)
+    thickness = _unfolded(wall.hull, wall.thickness(mesh.comm, x_phys))
     result = HollowPart(mesh.name, wall.hull, thickness, (wall.least, wall.most))
     check_surface(mesh.name, result.surface)
+    return result
+
+
+def _unfolded(hull: Hull, thickness: np.ndarray) -> np.ndarray:
+    """Return thickness (s, r), m, that is larger at corners beside which it is much larger.
+
+    The short cells there are `CORNER_CELL_RATIO` times as long as the corner is thick, and folded
+    where the wall beside it is thicker than that.
+    """
+    result = thickness.copy()
+    for at, corner in enumerate(hull.lead):
+        result[:, corner] = np.maximum(result[:, corner], thickness[:, at] / CORNER_STEP)
     return result
 
 

@@ -50,6 +50,16 @@ def test_meshes_have_the_same_surfaces():
         assert len(cells) == share * len(found.mesh(found.COARSER).cells)
 
 
+def test_walls_that_leap_beside_corners_have_no_folded_cells():
+    """Every point of the wall as thin or as thick as it may be."""
+    arm = solid_arm(MPI.COMM_SELF, cells=(8, 3, 2), hollow=True, wall=0.002, max_wall=0.004)
+    x_phys = np.where(np.arange(arm.mesh.num_cells) % 3, 0.0, 1.0)
+    found = make_hollow_part(arm.mesh, x_phys)
+    assert np.ptp(found.thickness) > 0.0005
+    for mesh in (found.mesh(found.COARSER), found.mesh()):
+        check_cells(mesh.points, mesh.cells[:, TENSOR[8, 3]])
+
+
 def test_no_curves_are_asked_for():
     """The inner surface has none."""
     arm = solid_arm(MPI.COMM_SELF, cells=(8, 3, 2), hollow=True, wall=0.002)
