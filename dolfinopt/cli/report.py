@@ -113,7 +113,7 @@ def _objective(result: Result, summary: Summary) -> str:
     """Return name, value and unit of the objective, what it stands for, and what was gained."""
     scene, response = result.scene, result.scene.objective.response
     name, value = response.label, result.evaluation.objective
-    if scene.scenarios:
+    if scene.scenarios and response.needs:  # the mass is the same in all
         how = "weighted sum" if scene.objective.scenarios == "sum" else "worst"
         name += f" ({how} of {len(scene.scenarios)} scenarios)"
     text = with_unit(f"{name} {value:.4g}", response.unit)
