@@ -3,9 +3,10 @@
 Corrections r_F = sum_k B_k(t) c_k of some joints, splines of degree 5, are such that the tip h of
 the flexible machine stays on the path y of the rigid one:
 
-    min over c   1/2 sum_i w_i |h(t_i, c) - y(t_i)|^2 + c' R c / 2,
+    min over c   1/2 sum_i w_i |P_i (h(t_i, c) - y(t_i))|^2 + c' R c / 2,
 
-R of their accelerations, by Gauss-Newton steps. The columns dh/dc follow from the linearised
+R of their accelerations, P on the directions in which these joints can move the tip, by
+Gauss-Newton steps. The columns dh/dc follow from the linearised
 collocation equations, all right sides at once, so that nothing is integrated backwards in time: the
 internal dynamics of a flexible arm are unstable (non-minimum phase), their bounded solution begins
 before the motion does, within `lead`. Source: Seifried, Dynamics of Underactuated Multibody Systems
@@ -34,7 +35,6 @@ from dolfinopt.dynamics.collocation import (
 )
 from dolfinopt.dynamics.machine_system import MachineSystem
 from dolfinopt.dynamics.measured import (
-    ACROSS_SHARE,
     CURVATURE_STEPS,
     CURVED_SHARE,
     EXACT,
@@ -228,18 +228,20 @@ def tip_by_joints(machine: MachineSystem, t: np.ndarray) -> np.ndarray:
     return np.asarray(J / machine.mechanism.levers)
 
 
-def across(machine: MachineSystem, joints: np.ndarray, t: np.ndarray, off: np.ndarray) -> float:
-    """Return how far the tip is off its path, m, where no corrected joint can move it.
+def directions(machine: MachineSystem, joints: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """Return the projections (n, d, d) on where joints can move the tip, on the desired motion.
+
+    Across them, as where a planar machine sags out of its plane, there is nothing to be had: a
+    five-bar's motors would leave its path by 14 mm for 2 mm of sag.
 
     Args:
-        machine: without corrections.
+        machine: with or without corrections.
         joints: (F,) rigid coordinates.
         t: (n,) s.
-        off: (n, d) all of it, m.
     """
-    J = tip_by_joints(machine, t)[:, :, joints]
-    along = J @ (np.linalg.pinv(J) @ off[:, :, None])
-    return float(lengths(off - along[:, :, 0]).max())
+    desired = replace(machine, motion=machine.path or machine.motion)
+    J = tip_by_joints(desired, t)[:, :, joints]
+    return np.asarray(J @ np.linalg.pinv(J))
 
 
 # -- linearised motion -----------------------------------------------------------------------
@@ -362,7 +364,8 @@ class FeedForward:
         redundant: whether more joints are corrected than the tip has directions.
         has_curvature: whether the coefficients follow the bodies by second derivatives, too.
         regularity: least singular value of the tip's Jacobian by these joints, over the reach.
-        before, left: largest distance of the tip from its path without and with them, m.
+        before, left: largest distance of the tip from its path, m: without them, as far as they can
+            take it away, and with them.
     """
 
     plain: MachineSystem
@@ -483,23 +486,29 @@ def tip_gradient(
 
 @dataclass(frozen=True, eq=False)
 class LeastSquares:
-    """The linearised problem of the corrections: min |W^1/2 (J c + gap)|^2 + c' R c.
+    """The linearised problem of the corrections: min |W^1/2 P (J c + gap)|^2 + c' R c.
 
     Attributes:
         t: (n,) instants at which the tip counts, s.
+        along: (n, d, d) where joints can move it, see `directions`.
         weights: (n d,) W.
-        by_coefficients: J (n d, p F).
-        gap: (n d,) m.
+        by_coefficients: J (n d, p F), along.
+        gap: (n d,) m, along.
         normal: J' W J + R.
         roughness: R (p F, p F): of the corrections' accelerations, and of their size.
     """
 
     t: np.ndarray
+    along: np.ndarray
     weights: np.ndarray
     by_coefficients: np.ndarray
     gap: np.ndarray
     normal: np.ndarray
     roughness: np.ndarray
+
+    def left(self, off: np.ndarray) -> np.ndarray:
+        """Return the part of distances from the path (n, d) that joints can take away, m."""
+        return np.asarray((self.along @ off[:, :, None])[:, :, 0])
 
     def step(self, coefficients: np.ndarray) -> np.ndarray:
         """Return coefficients (p, F) that are best by the linearised problem."""
@@ -515,13 +524,15 @@ def least_squares(
     knots = corrections.splines.knots
     t = np.sort(np.concatenate([knots, 0.5 * (knots[1:] + knots[:-1])]))
     answer = tip_response(machine, solution, corrections, t)
-    gap = (off_path(machine, solution, t) + answer.forced).ravel()
-    J = answer.by_coefficients.reshape(len(gap), -1)
+    along = directions(machine, corrections.joints, t)
+    off = off_path(machine, solution, t) + answer.forced
+    gap = (along @ off[:, :, None]).ravel()
+    J = (along @ answer.by_coefficients).reshape(len(gap), -1)
     weights = np.repeat(np.gradient(t), len(gap) // len(t))
     normal = J.T @ (weights[:, None] * J)
     share = OF_REDUNDANT if redundant else REGULARISATION
     roughness = share * np.trace(normal) * _roughness(corrections, t, redundant)
-    return LeastSquares(t, weights, J, gap, normal + roughness, roughness)
+    return LeastSquares(t, along, weights, J, gap, normal + roughness, roughness)
 
 
 def _roughness(corrections: Corrections, t: np.ndarray, redundant: bool) -> np.ndarray:
@@ -556,8 +567,8 @@ def feed_forward_of(
 ) -> FeedForward:
     """Return the corrections of a machine.
 
-    The knots are as close as it takes to leave `LEFT_AIM` of the deviation, or what no joint can
-    take away; or as they are asked for.
+    The knots are as close as it takes to leave `LEFT_AIM` of what joints can take away; or as they
+    are asked for.
 
     Args:
         machine: without corrections.
@@ -587,19 +598,19 @@ def feed_forward_of(
                 gap = squares.gap.reshape(len(squares.t), -1)
                 before = before or float(lengths(gap).max())  # that of the first, at rest
             else:  # what is left is answered by the same derivatives
-                squares = replace(squares, gap=off_path(moved, solution, squares.t).ravel())
+                off = off_path(moved, solution, squares.t)
+                squares = replace(squares, gap=squares.left(off).ravel())
             corrections = replace(corrections, coefficients=squares.step(corrections.coefficients))
             moved = corrected(machine, corrections)
             solution = guess = run(moved, guess=guess)
         off = off_path(moved, solution, squares.t)
-        left = float(lengths(off).max())
-        aim = max(LEFT_AIM * before, ACROSS_SHARE * across(machine, joints, squares.t, off))
-        if asked.spacing or left <= aim or left > 0.5 * last:
+        left = float(lengths(squares.left(off)).max())
+        if asked.spacing or left <= LEFT_AIM * before or left > 0.5 * last:
             break
         spacing, last = 0.5 * spacing, left
-    curved = redundant or left > CURVED_SHARE * before
+    curved, rest = redundant or left > CURVED_SHARE * before, float(lengths(off).max())
     return FeedForward(
-        machine, moved, solution, corrections, redundant, curved, regularity, before, left
+        machine, moved, solution, corrections, redundant, curved, regularity, before, rest
     )
 
 

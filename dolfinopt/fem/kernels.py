@@ -113,7 +113,7 @@ def compile_kernels(forms: Sequence[ufl.Form | Expression]) -> list[Kernel]:
             folders = [_folder(form) for form in forms]
         missing = [at for at in folders if not _is_complete(at)]
         if missing:
-            log.info("compiling %d forms, once", len(missing))
+            log.info("compiling %d form%s, once", len(missing), "s" * (len(missing) > 1))
         for at in missing:
             if at.exists():
                 log.info("%s: a compilation was interrupted there and is repeated", folder)

@@ -18,7 +18,6 @@ from mpi4py import MPI
 from scipy.interpolate import make_interp_spline
 from scipy.spatial import cKDTree
 
-from dolfinopt.density.measured import GREY
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 from dolfinopt.mesh.checks import cell_sizes, facet_corners
@@ -35,6 +34,8 @@ SAME = 2e-8  # distance from a line or circle, of the extent: Gmsh's points, fil
 SHARPEST = np.radians(40.0)  # turn from side to side up to which a polygon may stand for a curve
 FEWEST = 6  # points of an arc: a circle goes through any three
 STRAIGHT = 1e4  # radius of what is no circle, sizes of its points
+# Of the material, in grey cells: with 2 % a part is 4 % stiffer than the densities, as crisp ones.
+GREY_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -403,7 +404,7 @@ class Filled:
     @property
     def gray_words(self) -> list[str]:
         """What is said of a grey design."""
-        if self.grayness <= GREY:
+        if self.gray_share <= GREY_SHARE:
             return []
         return [
             f"arm {self.name!r}: grayness {self.grayness:.2g}: {100.0 * self.gray_share:.0f} % of "
