@@ -97,7 +97,9 @@ GAUSS_NEWTON_STEPS = 2  # the first leaves 4e-3 of it on two_arm, the second 1e-
 # where the gradient of 1e-8 is 1e-4 off.
 REGULARISATION = 1e-8
 OF_REDUNDANT = 1e-6
-CURVED_SHARE = 1e-3  # of the deviation is left: second derivatives count
+# Of the deviation, with which left second derivatives count: with 3e-5 left (cart and second arm of
+# two_arm) a slope is 6e-4 off without them, with 2e-5 (both arms) less than 1e-5.
+CURVED_SHARE = 1e-5
 CURVATURE_STEPS = 3
 JOINT_DIFFERENCE = 1e-3  # rad, m, of the joints, by which these are differences
 FORCE_INTERVAL = 1e-3  # s, between the known forces of a control
