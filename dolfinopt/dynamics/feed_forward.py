@@ -592,8 +592,9 @@ def feed_forward_of(
         splines = Splines(graded_knots(machine.breakpoints, spacing))
         none = np.zeros((splines.count, len(joints)))
         corrections, moved, solution = Corrections(joints, splines, none), machine, first
-        for number in range(1 + GAUSS_NEWTON_STEPS):
-            if number < GAUSS_NEWTON_STEPS:
+        steps = GAUSS_NEWTON_STEPS * (2 if redundant else 1)
+        for number in range(1 + steps):
+            if number < steps:
                 squares = least_squares(moved, solution, corrections, redundant)
                 gap = squares.gap.reshape(len(squares.t), -1)
                 before = before or float(lengths(gap).max())  # that of the first, at rest

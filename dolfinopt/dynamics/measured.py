@@ -92,7 +92,9 @@ FINEST_KNOTS = 16.0  # times closer are knots beside breakpoints, where steps gr
 KNOT_GROWTH = 1.5  # a step over the one before, away from breakpoints
 FIRST_SPACING = 0.02  # of the motion's duration
 LEFT_AIM = 1e-4  # of the deviation without corrections
-GAUSS_NEWTON_STEPS = 2  # the first leaves 4e-3 of it on two_arm, the second 1e-5
+# The first leaves 4e-3 of it on two_arm, the second 1e-5. Joints in surplus share the work by twice
+# as many: with two a slope is 1e-4 off.
+GAUSS_NEWTON_STEPS = 2
 # Of the normal matrix's trace: it leaves 1e-6 m of two_arm's 55 mm; with joints in surplus 4e-7 m,
 # where the gradient of 1e-8 is 1e-4 off.
 REGULARISATION = 1e-8
