@@ -679,10 +679,10 @@ class Model:
             plane = self.scene.dimension == 2
             partition = partition_arms(self._world, self.scene.cell_counts, whole=plane)
             arms = build_arms(self.scene, partition, self._profile)
-            whole = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
-            self._order = {k: canonical_order(points) for k, points in whole.items()}
+            centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
+            self._order = {k: canonical_order(points) for k, points in centroids.items()}
             names = self.scene.arms
-            self._centroids = {names[k].name: whole[k][o] for k, o in self._order.items()}
+            self._centroids = {names[k].name: centroids[k][o] for k, o in self._order.items()}
             self._built = partition, arms
         return self._built
 
@@ -702,10 +702,10 @@ class Model:
             x = x.design
         if isinstance(x, (str, os.PathLike)):
             return partition, arms, read_design(Path(x), partition, arms)
-        whole = on_root(self._world, self._checked, x)
+        checked = on_root(self._world, self._checked, x)
         sizes = {k: partition.comm.allgather(arm.mesh.num_cells) for k, arm in arms.items()}
         parts = {k: np.cumsum([0, *size])[partition.comm.rank :] for k, size in sizes.items()}
-        return partition, arms, {k: whole[k][part[0] : part[1]] for k, part in parts.items()}
+        return partition, arms, {k: checked[k][part[0] : part[1]] for k, part in parts.items()}
 
     def _under_law(self, x: Design) -> Scene:
         """Return the scene, with the law of a design that has one."""
@@ -720,7 +720,7 @@ class Model:
         if not isinstance(x, Mapping) or sorted(x) != sorted(names):
             result = ", ".join(map(str, x)) if isinstance(x, Mapping) else type(x).__name__
             raise InputError(f"design: expected densities of {', '.join(names)}, found {result}")
-        whole = {}
+        checked = {}
         for (k, order), name in zip(self._order.items(), names, strict=True):
             values = np.asarray(x[name])
             if values.shape != order.shape:
@@ -729,9 +729,9 @@ class Model:
                     f"found {values.shape}"
                 )
             values = physical(f"design: density of arm {name!r}", values)
-            whole[k] = np.empty_like(values)
-            whole[k][order] = values
-        return whole
+            checked[k] = np.empty_like(values)
+            checked[k][order] = values
+        return checked
 
     def _gathered(
         self, cells: Mapping[int, np.ndarray], partition: Partition | None = None
@@ -741,9 +741,9 @@ class Model:
         Derivatives by the variables of the motion's law are called "motion".
         """
         of_arms = {k: cell for k, cell in cells.items() if k != LAW}
-        whole = gather_cells(partition or self._arms()[0], of_arms)
-        result = {self.scene.arms[k].name: item[self._order[k]] for k, item in whole.items()}
-        return result | {"motion": cells[LAW]} if whole and LAW in cells else result
+        gathered = gather_cells(partition or self._arms()[0], of_arms)
+        result = {self.scene.arms[k].name: item[self._order[k]] for k, item in gathered.items()}
+        return result | {"motion": cells[LAW]} if gathered and LAW in cells else result
 
     @contextmanager
     def _folder(self, folder: str | Path | None) -> Iterator[Path]:

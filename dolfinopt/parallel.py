@@ -150,12 +150,12 @@ def gather_cells(partition: Partition, mine: Mapping[int, np.ndarray]) -> dict[i
     Returns:
         One array (n_cells, ...) an arm on the root, empty elsewhere.
     """
-    whole = {}
+    pieces_of_all = {}
     for arm, values in mine.items():
         pieces = partition.comm.gather(values, root=0)
         if pieces is not None:
-            whole[arm] = np.concatenate(pieces)
-    return gather_arms(partition, whole)
+            pieces_of_all[arm] = np.concatenate(pieces)
+    return gather_arms(partition, pieces_of_all)
 
 
 # -- one ending for all ranks ------------------------------------------------------------------

@@ -410,12 +410,12 @@ class Arm:
             held[at[nodes]] = number
         parts = mesh.comm.gather((corners, solid, held, mesh.area), root=0) or ()
 
-        def found() -> Contacts:
+        def contacts_of_all() -> Contacts:
             return contacts_of(*map(np.concatenate, zip(*parts, strict=True)))
 
-        whole: Contacts = on_root(mesh.comm, found)
+        gathered: Contacts = on_root(mesh.comm, contacts_of_all)
         first = sum(mesh.comm.allgather(mesh.num_cells)[: mesh.comm.rank])
-        return replace(whole, kept=whole.kept[first : first + mesh.num_cells])
+        return replace(gathered, kept=gathered.kept[first : first + mesh.num_cells])
 
 
 def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> dict[int, Arm]:
@@ -547,9 +547,9 @@ class Patterns:
         if not self.repeats:
             return dict(densities)
         patterns = set(self.repeats.values())
-        whole = self._whole({k: x for k, x in densities.items() if k in patterns})
+        by_pattern = self._gathered({k: x for k, x in densities.items() if k in patterns})
         repeated = {
-            k: whole[pattern][self._place[k]]
+            k: by_pattern[pattern][self._place[k]]
             for k, pattern in self.repeats.items()
             if k in self._place
         }
@@ -567,32 +567,32 @@ class Patterns:
         """
         if not self.repeats:
             return dict(gradient)
-        whole = self._whole({k: g for k, g in gradient.items() if k in self.repeats})
+        by_pattern = self._gathered({k: g for k, g in gradient.items() if k in self.repeats})
         total = {k: g for k, g in gradient.items() if k not in self.repeats}
-        for k in sorted(whole):  # the same order on any number of ranks
+        for k in sorted(by_pattern):  # the same order on any number of ranks
             pattern = self.repeats[k]
             if pattern in self._place:
-                part = whole[k][self._place[pattern]]
+                part = by_pattern[k][self._place[pattern]]
                 total[pattern] = total[pattern] + part if pattern in total else part
         return total
 
-    def _whole(self, parts: Cells) -> dict[int, np.ndarray]:
+    def _gathered(self, parts: Cells) -> dict[int, np.ndarray]:
         """Return arrays of whole arms by the places of their cells, on all ranks (collective)."""
-        whole: dict[int, np.ndarray] = {}
+        gathered: dict[int, np.ndarray] = {}
         for pieces in self._world.allgather({k: (self._place[k], x) for k, x in parts.items()}):
             for k, (place, x) in pieces.items():
-                whole.setdefault(k, np.zeros(self._size[k]))[place] = x
-        return whole
+                gathered.setdefault(k, np.zeros(self._size[k]))[place] = x
+        return gathered
 
 
 def _grid_place(arm: Arm, scene: Scene) -> np.ndarray:
     """Return the place (n_cells,) of a rectangular arm's cells: rows across, from inboard on."""
-    one = scene.arms[arm.places[0]]
-    assert one.cells is not None
-    along, *across = one.cells
+    box = scene.arms[arm.places[0]]
+    assert box.cells is not None
+    along, *across = box.cells
     x, *others = arm.mesh.centroid.T
-    place = np.floor(x / one.length * along).astype(int)
-    for y, size, count in zip(others, (one.height, one.thickness), across, strict=False):
+    place = np.floor(x / box.length * along).astype(int)
+    for y, size, count in zip(others, (box.height, box.thickness), across, strict=False):
         place = place * count + np.floor((y / size + 0.5) * count).astype(int)
     return np.asarray(place)
 

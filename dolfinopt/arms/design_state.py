@@ -294,9 +294,9 @@ def options(scene: scenes.Scene, num_modes: int) -> Options:
     return Options(num_modes, reduction.shifts, reduction.band, damping)
 
 
-def same_basis(one: scenes.Scene, other: scenes.Scene) -> bool:
+def same_basis(scene: scenes.Scene, other: scenes.Scene) -> bool:
     """Return whether both scenes reduce an arm to the same basis, the number of modes aside."""
     # The Gramian knows the damping, other bases do not.
-    return one.reduction == other.reduction and (
-        one.damping == other.damping or one.reduction.method != "balanced"
+    return scene.reduction == other.reduction and (
+        scene.damping == other.damping or scene.reduction.method != "balanced"
     )

@@ -98,9 +98,9 @@ def _motions(d: int) -> np.ndarray:
 def mass_matrix(body: ShapeIntegrals) -> np.ndarray:
     """Return the inertia (b, b) of a rigid body under displacement and rotation of its origin."""
     moments = np.tensordot(body.W[:, 0, 0], components(DIMENSIONS[len(body.w)].E), 1)
-    whole = np.block([[np.full((1, 1), body.mass), body.w[:, :1].T], [body.w[:, :1], moments]])
+    rigid = np.block([[np.full((1, 1), body.mass), body.w[:, :1].T], [body.w[:, :1], moments]])
     A = _motions(len(body.w))
-    return np.einsum("pik,qil,pq->kl", A, A, whole)
+    return np.einsum("pik,qil,pq->kl", A, A, rigid)
 
 
 def by_integrals(body: ShapeIntegrals, by_matrix: np.ndarray) -> ShapeIntegrals:
@@ -172,14 +172,14 @@ class FrozenTree:
         """
         result = []
         for k, body in enumerate(self.mechanism.bodies):
-            whole = np.zeros(2 * (len(body.outboard),))
+            matrix = np.zeros(2 * (len(body.outboard),))
             for s in self.mechanism.sites[k]:
                 M = sum(self._loads_beyond(k, s), np.zeros(2 * (self.mechanism.dim.b,)))
                 for i, T in self._beyond(k, s):
                     M += T.T @ mass_matrix(self.mechanism.bodies[i]) @ T
                 place = self._place(s)
-                whole[place, place] = self._kept(M)
-            result.append(whole)
+                matrix[place, place] = self._kept(M)
+            result.append(matrix)
         return result
 
     def _place(self, interface: int) -> slice:

@@ -158,14 +158,14 @@ class _Solid:
         around = np.setdiff1d(self.near[group].indices, group)
         around = around[kept[around]]
         piece = connected_components(self.by_face[around][:, around], directed=False)[1]
-        beside = np.isin(around, self.by_face[group].indices)
+        adjacent = np.isin(around, self.by_face[group].indices)
         lone = 0
         for end in self.ends:  # an interface joins what is on it
             on, held = end[around], bool(end[group].any())
             piece[np.isin(piece, piece[on])] = piece[on].min(initial=len(around))
-            beside |= on & held
+            adjacent |= on & held
             lone += held and not on.any()
-        return len(np.unique(piece[beside])) + lone <= 1
+        return len(np.unique(piece[adjacent])) + lone <= 1
 
     def _joined(self, kept: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return those of the cells that hang on the first interface, and whether all others do."""
@@ -178,12 +178,12 @@ class _Solid:
         first = number[n] if ends else -1
         return kept & (number[:n] == first), bool(ends and (number[n:] == first).all())
 
-    def worst(self, found: Sequence[list[np.ndarray]]) -> np.ndarray:
+    def worst(self, contacts: Sequence[list[np.ndarray]]) -> np.ndarray:
         """Return the places (k, d) of those contacts that join the largest pieces, m."""
         number = self.pieces(self.every)
         volume = np.bincount(number, self.volume)
         rank = []
-        for groups in found:
+        for groups in contacts:
             joined = np.unique(number[np.concatenate(groups)])
             second = np.sort(volume[joined])[-2] if len(joined) > 1 else 0.0
             common = self.nodes[groups[0][0]]

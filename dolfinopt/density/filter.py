@@ -76,7 +76,7 @@ class HelmholtzFilter:
         self.keeps_bounds = max(skew) <= FILE_ROUNDING_SHARE
         W = r * r * _fluxes(sides)
         flux, leak = W.sum(axis=2), np.where(sides.open, r * sides.length, 0.0)
-        whole = sides.area + flux.sum(axis=1)
+        diagonal = sides.area + flux.sum(axis=1)
         facets = mesh.mesh.topology.index_map(mesh.dim - 1)
         number = facets.local_to_global(sides.facet.ravel().astype(np.int32))
         number = number.astype(PETSc.IntType).reshape(sides.facet.shape)
@@ -84,11 +84,11 @@ class HelmholtzFilter:
         if self.keeps_bounds:
             # Half as many unknowns: 5 % of an iteration at 400 x 24 cells.
             B, D = (_matrix(mesh, x[:, None, :], cells, number) for x in (flux, flux + leak))
-            matrix = _without_facets(B, D, whole)
-            self._keep = np.zeros_like(whole)
+            matrix = _without_facets(B, D, diagonal)
+            self._keep = np.zeros_like(diagonal)
         else:
-            self._keep, c = sides.area / whole, flux / whole[:, None]
-            A = W - whole[:, None, None] * c[:, :, None] * c[:, None, :]
+            self._keep, c = sides.area / diagonal, flux / diagonal[:, None]
+            A = W - diagonal[:, None, None] * c[:, :, None] * c[:, None, :]
             A += leak[:, :, None] * np.eye(leak.shape[1])
             self._C = _matrix(mesh, c[:, None, :], cells, number)
             matrix = _matrix(mesh, A, number, number)
@@ -187,7 +187,7 @@ def _fluxes(sides: _Sides) -> np.ndarray:
     return scaled @ G + S.swapaxes(1, 2) @ ((sides.length / sides.distance)[..., None] * S)
 
 
-def _without_facets(B: PETSc.Mat, D: PETSc.Mat, whole: np.ndarray) -> PETSc.Mat:
+def _without_facets(B: PETSc.Mat, D: PETSc.Mat, diagonal: np.ndarray) -> PETSc.Mat:
     """Return whole - B D^-1 B' over the cells, D the sums of a matrix' columns."""
     cells, facets = B.createVecs()[::-1]
     cells.set(1.0)
@@ -198,7 +198,7 @@ def _without_facets(B: PETSc.Mat, D: PETSc.Mat, whole: np.ndarray) -> PETSc.Mat:
     Bt = B.transpose(PETSc.Mat())
     matrix = Bt.transposeMatMult(Bt)
     matrix.scale(-1.0)
-    cells.array = whole
+    cells.array = diagonal
     matrix.setDiagonal(cells, addv=PETSc.InsertMode.ADD_VALUES)
     return matrix
 
@@ -366,10 +366,10 @@ def project(x: np.ndarray, beta: float, eta: float) -> Projected:
     near = np.exp(-2.0 * beta * distance)
     right = 1.0 + np.exp(-2.0 * beta * (1.0 - eta))
     left = 1.0 + np.exp(-2.0 * beta * eta)
-    whole = -np.expm1(-2.0 * beta)
+    span = -np.expm1(-2.0 * beta)
     value = np.where(x < eta, near, 1.0) * -np.expm1(-2.0 * beta * x) * right
-    value /= whole * (1.0 + near)
-    slope = 2.0 * beta / whole * left * right * near / (1.0 + near) ** 2
+    value /= span * (1.0 + near)
+    slope = 2.0 * beta / span * left * right * near / (1.0 + near) ** 2
     return Projected(np.minimum(value, 1.0), slope)  # one unit of rounding above 1 at most
 
 

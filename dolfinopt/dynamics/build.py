@@ -326,9 +326,9 @@ class Trajectory(MachineTrajectory):
 
         With a duration k times as long rates are 1 / k, accelerations 1 / k^2 times as large.
         """
-        scene, one = with_law(self.scene, values), self.solution
+        scene, rigid = with_law(self.scene, values), self.solution
         k = scene.motion.duration / self.scene.motion.duration
-        solution = replace(one, time_grid=k * one.time_grid, qd=one.qd / k, a=one.a / k**2)
+        solution = replace(rigid, time_grid=k * rigid.time_grid, qd=rigid.qd / k, a=rigid.a / k**2)
         problem = build_system(scene, list(self.mechanism.arms))
         t = k * self.t
         return replace(self, problem=problem, scene=scene, solution=solution, t=t, scenarios=())
@@ -342,7 +342,7 @@ class Trajectory(MachineTrajectory):
         return self.problem.at_stages(solution.time_grid, solution.nodes).residual(*rates)
 
     @cached_property
-    def beside(self) -> tuple[tuple[float, Self, Self], ...]:
+    def law_neighbours(self) -> tuple[tuple[float, Self, Self], ...]:
         """A step of every variable of the law, and the motion with so much more and less of it."""
         here, result = law_values(self.scene), []
         for size, item in zip(np.diff(law_bounds(self.scene), axis=0)[0], np.eye(len(here))):
@@ -360,10 +360,12 @@ class Trajectory(MachineTrajectory):
         if not law_names(self.scene):
             return None
 
-        def lagrangian(one: Self) -> float:
-            return value(one) + float(np.vdot(multipliers, one.residual))
+        def lagrangian(trajectory: Self) -> float:
+            return value(trajectory) + float(np.vdot(multipliers, trajectory.residual))
 
-        changes = ((lagrangian(a) - lagrangian(b)) / (2.0 * step) for step, a, b in self.beside)
+        changes = (
+            (lagrangian(a) - lagrangian(b)) / (2.0 * step) for step, a, b in self.law_neighbours
+        )
         return np.array(list(changes))
 
 

@@ -194,9 +194,9 @@ def tip_jacobians(
     by_q, by_rigid = [], []
     for axis in np.eye(d):
         weights = np.tile(axis, (len(q), 1))
-        one = end_effector_gradient(machine.mechanism, motion, q, weights)
-        by_q.append(one[0])
-        by_rigid.append(one[1])
+        slopes = end_effector_gradient(machine.mechanism, motion, q, weights)
+        by_q.append(slopes[0])
+        by_rigid.append(slopes[1])
     return np.stack(by_q, axis=1), np.stack(by_rigid, axis=1)
 
 
@@ -326,14 +326,14 @@ def _sampled(
     return out
 
 
-def internal_rates(found: FeedForward) -> np.ndarray | None:
+def internal_rates(feed_forward: FeedForward) -> np.ndarray | None:
     """Return the eigenvalues (2 N,) of what the arms may still do while the tip is held, 1/s.
 
     At rest at t = 0, of a machine on a prescribed motion that closes no loop. With r_F = P q that
     keep the tip, P = -H_F^-1 H_q, (K + K_F P) q + (D + D_F P) q' + (M + M_F P) q'' = 0: those with
     positive real part are unstable, and begin before the motion.
     """
-    machine, corrections = found.machine, found.corrections
+    machine, corrections = feed_forward.machine, feed_forward.corrections
     if not machine.is_prescribed:
         return None
     y = machine.initial_state()[0]
@@ -345,8 +345,8 @@ def internal_rates(found: FeedForward) -> np.ndarray | None:
     by_joints = state.by_command(corrections.joints)[0]
     K, D, M = (x + by_joints[:, :, k] @ P for k, x in enumerate(own))
     inverse, size = np.linalg.inv(M), len(M)
-    zero, one = np.zeros((size, size)), np.eye(size)
-    return np.asarray(np.linalg.eigvals(np.block([[zero, one], [-inverse @ K, -inverse @ D]])))
+    zero, identity = np.zeros((size, size)), np.eye(size)
+    return np.asarray(np.linalg.eigvals(np.block([[zero, identity], [-inverse @ K, -inverse @ D]])))
 
 
 # -- least squares ---------------------------------------------------------------------------
@@ -399,11 +399,11 @@ class FeedForward:
         """
         squares = self._squares
         change = np.linalg.solve(squares.normal, by_coefficients.ravel())
-        beside: list[ShapeIntegrals] = []
+        further: list[ShapeIntegrals] = []
         if self.has_curvature:
             first = np.linalg.norm(change)
             for _ in range(CURVATURE_STEPS):
-                curved, beside = self._curvature(change)
+                curved, further = self._curvature(change)
                 change = np.linalg.solve(squares.normal, by_coefficients.ravel() + curved)
             if np.linalg.norm(change) > 2.0 * first:
                 raise ConvergenceError(
@@ -412,7 +412,7 @@ class FeedForward:
                 )
         weights = -squares.weights * (squares.by_coefficients @ change)
         result = self._follow(self.machine, self.solution, weights)[0]
-        return add_gradients(result, beside) if beside else result
+        return add_gradients(result, further) if further else result
 
     def _curvature(self, change: np.ndarray) -> tuple[np.ndarray, list[ShapeIntegrals]]:
         """Return -S mu (p F,) and -d/d eps of the bodies' derivative, by central differences."""

@@ -77,10 +77,10 @@ def _changed(body: ShapeIntegrals, T: np.ndarray) -> ShapeIntegrals:
     """Return the body in other coordinates."""
     # Stiffness, and damping in proportion to it, lose the rounding beside their diagonals: whoever
     # uses them sees that the coordinates are uncoupled by them.
-    changed, one = body.in_basis(T), np.eye(body.num_modes)
-    if np.abs(changed.K - one).max(initial=0.0) > ROUNDING or not len(one):
+    changed, identity = body.in_basis(T), np.eye(body.num_modes)
+    if np.abs(changed.K - identity).max(initial=0.0) > ROUNDING or not len(identity):
         return changed
     largest = np.abs(body.K).argmax()
     share = float(body.D.flat[largest] / body.K.flat[largest])
-    proportional = np.abs(changed.D - share * one).max() <= ROUNDING * abs(share)
-    return replace(changed, K=one, D=share * one if proportional else changed.D)
+    proportional = np.abs(changed.D - share * identity).max() <= ROUNDING * abs(share)
+    return replace(changed, K=identity, D=share * identity if proportional else changed.D)

@@ -36,7 +36,7 @@ class Poles:
             lambda through N.
     """
 
-    one: Linearised
+    linear: Linearised
     values: np.ndarray
     vibrations: np.ndarray
     left: np.ndarray
@@ -56,18 +56,18 @@ class Poles:
         """
         # With no pole one of no weight: what follows has an instant at least.
         used = np.flatnonzero(by_values) if by_values.any() else np.zeros(1, dtype=int)
-        S, system = len(self.left), self.one.system
+        S, system = len(self.left), self.linear.system
         along = _real_parts(self.vibrations[:, :, used])
         left = _real_parts(-by_values[used] * self.left[:, used], conjugate=True)
         held = _real_parts(-by_values[used] * self.constraint_weights[:, :, used], conjugate=True)
-        reach = self.one.to_rates[0][-1] @ np.stack([self.one.size(np.abs(x)) for x in along])
+        reach = self.linear.to_rates[0][-1] @ np.stack([self.linear.size(np.abs(x)) for x in along])
         steps = POLE_STEP / np.where(reach > 0.0, reach, 1.0)
         offsets = np.multiply.outer(OFFSETS, steps)  # (7, k)
         shares = np.multiply.outer(DIFFERENCES[1], 1.0 / steps)
         change = (along[..., None, :] * offsets).reshape(3, S, -1).transpose(0, 2, 1)
         rows = (left[:, None, :] * shares).reshape(S, -1).T.copy()
-        rates = self.one.rates[:, None] + change
-        instants = system.at(np.repeat(self.one.t, len(rows)))
+        rates = self.linear.rates[:, None] + change
+        instants = system.at(np.repeat(self.linear.t, len(rows)))
         tangent = instants.linearise(*rates)
         by_rates = np.stack([x.sum(axis=0) for x in tangent.transposed(rows)])
         by_bodies = instants.state(*rates).body_gradient(rows)
@@ -87,11 +87,15 @@ class Poles:
             change: (3, n, S) of the rates, of every motion along which g is differentiated.
             weights: (3, n, m).
         """
-        one, columns, moving = self.one, self.one.system.columns, self.one.system.ends[1]
-        move, differentiate = one.to_rates
-        poses = np.repeat((move @ one.motion)[:, None], change.shape[1], axis=1)
+        linear, columns, moving = (
+            self.linear,
+            self.linear.system.columns,
+            self.linear.system.ends[1],
+        )
+        move, differentiate = linear.to_rates
+        poses = np.repeat((move @ linear.motion)[:, None], change.shape[1], axis=1)
         poses[:, :, columns] += np.tensordot(move, change[:, :, :moving], 1)
-        here = one.loops(poses.reshape(-1, poses.shape[2]))
+        here = linear.loops(poses.reshape(-1, poses.shape[2]))
         by_gap = np.tensordot(differentiate.T, weights, 1).reshape(-1, weights.shape[2])
         by_pose = np.einsum("nm,nmc->nc", by_gap, here.jacobian)[:, columns]
         by_rates = move.T @ by_pose.reshape(len(move), -1, moving).sum(axis=1)

@@ -134,9 +134,9 @@ class Preconditioner:
 
 def unchanged(system: System) -> Preconditioner:
     """Return a system in its own coordinates: all are treated densely, and it is marched."""
-    one = np.ones(system.num_coordinates)
-    same = np.diag(one)
-    return Preconditioner(system, 0.0 * one, (one, 0.0 * one, one), same, same)
+    ones = np.ones(system.num_coordinates)
+    same = np.diag(ones)
+    return Preconditioner(system, 0.0 * ones, (ones, 0.0 * ones, ones), same, same)
 
 
 def relative_error(system: System | Mechanism, error: np.ndarray, q: np.ndarray) -> float:

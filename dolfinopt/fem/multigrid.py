@@ -89,7 +89,7 @@ def box_of(T: InterfaceTransformation, cells: Cells, centroid: np.ndarray) -> Bo
     low = comm.allreduce(places.min(axis=0, initial=np.inf), op=np.minimum)
     high = comm.allreduce(places.max(axis=0, initial=-np.inf), op=np.maximum)
     corners = places[cells.operators.cells[:1]]
-    first = next(one for one in comm.allgather(corners) if len(one))[0]
+    first = next(nodes for nodes in comm.allgather(corners) if len(nodes))[0]
     edges = np.ptp(first, axis=0)
     counts = np.rint((high - low) / edges)
     shape = tuple(int(n) for n in counts)
@@ -112,9 +112,9 @@ def box_of(T: InterfaceTransformation, cells: Cells, centroid: np.ndarray) -> Bo
     clamped = by_node < layer
     fits = fits and fit and bool((clamped == T.inboard).all())
     fits = fits and bool((inner == ~(T.inboard | T.outboard)).all())
-    found = np.concatenate(comm.allgather(by_cell))
-    whole = len(found) == np.prod(shape) == len(np.unique(found))
-    if not comm.allreduce(fits and whole and shape[0] > 1, op=MPI.LAND):
+    numbers = np.concatenate(comm.allgather(by_cell))
+    complete = len(numbers) == np.prod(shape) == len(np.unique(numbers))
+    if not comm.allreduce(fits and complete and shape[0] > 1, op=MPI.LAND):
         return None
     away = first - first.min(axis=0) - edges * np.array(CORNERS)[:, None]
     order = np.abs(away).sum(axis=2).argmin(axis=1)  # of the cell's nodes
@@ -127,7 +127,7 @@ def box_of(T: InterfaceTransformation, cells: Cells, centroid: np.ndarray) -> Bo
         shape,
         edges,
         cells.stiffness[0][np.ix_(dofs, dofs)],
-        found,
+        numbers,
         np.concatenate(comm.allgather(by_node[T.interior_nodes])) - layer,
         slice(before, before + count),
         rigid_motions(end[:, AXES] - T.places[0]),
@@ -166,8 +166,8 @@ class Mesh:
         self._each = self._young.ravel()[: self._count]
         diagonal = np.zeros((3, self._size))
         entries = np.diag(self._box.stiffness).reshape(8, 3, 1)
-        for offset, one in zip(self._offsets, entries, strict=True):
-            diagonal[:, offset : offset + self._count] += one * self._each
+        for offset, kind_entries in zip(self._offsets, entries, strict=True):
+            diagonal[:, offset : offset + self._count] += kind_entries * self._each
         self.inverse_diagonal = np.zeros((self._rows, 1))
         self.inverse_diagonal[: self._interior, 0] = 1.0 / self._inner(diagonal).ravel()
 
@@ -177,13 +177,13 @@ class Mesh:
     def times(self, X: np.ndarray) -> np.ndarray:
         """Return K X (rows, k)."""
         k, U = X.shape[1], np.zeros((3, X.shape[1], self._size))
-        for one, column in zip(U.swapaxes(0, 1), X[: self._interior].T, strict=True):
-            self._inner(one)[...] = column.reshape(3, -1)
+        for direction, column in zip(U.swapaxes(0, 1), X[: self._interior].T, strict=True):
+            self._inner(direction)[...] = column.reshape(3, -1)
         U[..., -self._layer :] = (self._rigid @ X[self._interior :]).swapaxes(1, 2)
         forces = self._forces(U)
         out = np.empty((self._rows, k), order="F")
-        for one, column in zip(forces.swapaxes(0, 1), out.T, strict=True):
-            column[: self._interior].reshape(3, -1)[...] = self._inner(one)
+        for direction, column in zip(forces.swapaxes(0, 1), out.T, strict=True):
+            column[: self._interior].reshape(3, -1)[...] = self._inner(direction)
         end = forces[..., -self._layer :]
         out[self._interior :] = np.einsum("cnb,ckn->bk", self._rigid, end)
         return out
@@ -195,12 +195,12 @@ class Mesh:
         for start in range(0, self._count, step):
             stop = min(start + step, self._count)
             values = np.empty((8, 3, k, stop - start))
-            for offset, one in zip(self._offsets, values, strict=True):
-                one[...] = U[..., start + offset : stop + offset]
+            for offset, piece in zip(self._offsets, values, strict=True):
+                piece[...] = U[..., start + offset : stop + offset]
             forces = (self._box.stiffness @ values.reshape(24, -1)).reshape(values.shape)
             forces *= self._each[start:stop]
-            for offset, one in zip(self._offsets, forces, strict=True):
-                out[..., start + offset : stop + offset] += one
+            for offset, piece in zip(self._offsets, forces, strict=True):
+                out[..., start + offset : stop + offset] += piece
         return out
 
 
@@ -215,10 +215,10 @@ class Grid:
 
     def __init__(self, box: Box, kept: Sequence[np.ndarray], rigid: np.ndarray):
         """Lay down the pattern; `kept` are lines of the mesh, `rigid` (n, 3, b) of their end."""
-        lines = tuple(len(one) for one in kept)
+        lines = tuple(len(line) for line in kept)
         number = np.arange(np.prod(lines)).reshape(lines)
         sides = slice(None, -1), slice(1, None)
-        corners = [number[tuple(sides[i] for i in one)].ravel() for one in CORNERS]
+        corners = [number[tuple(sides[i] for i in line)].ravel() for line in CORNERS]
         self._pairs = NodePairs(np.column_stack(corners), number.size)
         self._by_kind, self._stiffness = _cells_by_kind(box, kept)
         self.highest = _highest(self._stiffness)
@@ -278,10 +278,10 @@ def _cells_by_kind(box: Box, kept: Sequence[np.ndarray]) -> tuple[sp.csr_matrix,
         steps.append([np.column_stack([1.0 - xi, xi]) for xi in each.T])
     shape = [len(lines) - 1 for lines in kept]
     coarse = np.ravel_multi_index(np.ix_(*place), shape).ravel()
-    kind = np.ravel_multi_index(np.ix_(*kinds), [len(one) for one in steps]).ravel()
-    P = [np.kron(reduce(np.kron, one), np.eye(3)) for one in product(*steps)]
+    kind = np.ravel_multi_index(np.ix_(*kinds), [len(piece) for piece in steps]).ravel()
+    P = [np.kron(reduce(np.kron, piece), np.eye(3)) for piece in product(*steps)]
     entries = sp.coo_matrix((np.arange(len(kind)), (coarse, kind)), (np.prod(shape), len(P)))
-    return entries.tocsr(), np.array([one.T @ box.stiffness @ one for one in P])
+    return entries.tocsr(), np.array([piece.T @ box.stiffness @ piece for piece in P])
 
 
 def _highest(stiffness: np.ndarray) -> float:
@@ -313,7 +313,7 @@ class BoxMultigrid:
         self.steps: list[tuple[sp.csr_matrix, sp.csr_matrix]] = []
         self.works = False
         lines = [np.arange(n + 1) for n in box.shape]
-        section = rigid.reshape(*(len(one) for one in lines[1:]), *rigid.shape[1:])
+        section = rigid.reshape(*(len(line) for line in lines[1:]), *rigid.shape[1:])
         while True:
             kept = coarser(lines, box.edges)
             self._coarsest = Grid(box, kept, np.concatenate(section[np.ix_(*kept[1:])]))
@@ -324,7 +324,7 @@ class BoxMultigrid:
                 P = P[np.append(order, np.arange(inner, P.shape[0]))]
             self.levels.append(self._coarsest)
             self.steps.append((P, P.T.tocsr()))
-            last = [len(one) for one in kept] == [len(one) for one in coarser(kept, box.edges)]
+            last = [len(line) for line in kept] == [len(line) for line in coarser(kept, box.edges)]
             if last or self._coarsest.band_work <= COARSEST_BAND_WORK:
                 break
             lines = kept
@@ -355,13 +355,13 @@ class BoxMultigrid:
 
 def coarser(lines: Sequence[np.ndarray], edges: np.ndarray) -> list[np.ndarray]:
     """Return every second one of the lines, in directions where cells are short; or all."""
-    length = np.array([np.diff(one).max() for one in lines]) * edges
+    length = np.array([np.diff(line).max() for line in lines]) * edges
     least = [3, 2, 2]  # cells that can be joined: along, one layer of nodes stays between the ends
-    can = [len(one) > n for one, n in zip(lines, least, strict=True)]
+    can = [len(line) > n for line, n in zip(lines, least, strict=True)]
     longest = 2.0 * length[can].min(initial=np.inf)  # those are joined cells' edges then
     return [
-        np.unique(np.append(one[::2], one[-1])) if ok and h <= longest else one
-        for one, ok, h in zip(lines, can, length, strict=True)
+        np.unique(np.append(line[::2], line[-1])) if ok and h <= longest else line
+        for line, ok, h in zip(lines, can, length, strict=True)
     ]
 
 
@@ -387,9 +387,9 @@ def _interpolation(fine: np.ndarray, coarse: np.ndarray) -> sp.csr_matrix:
     share = (fine - coarse[cell]) / (coarse[cell + 1] - coarse[cell])
     at = np.arange(len(fine))
     values = np.append(1.0 - share, share), (np.append(at, at), np.append(cell, cell + 1))
-    found = sp.csr_matrix(values, (len(fine), len(coarse)))
-    found.eliminate_zeros()
-    return found
+    matrix = sp.csr_matrix(values, (len(fine), len(coarse)))
+    matrix.eliminate_zeros()
+    return matrix
 
 
 def smoothed(level: Level, residual: np.ndarray, last: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -502,10 +502,10 @@ class MultigridSolver:
 
     def update(self, K: Any) -> None:
         """Take another design."""
-        whole = self._box.comm.gather(K.scale)
-        if whole is not None:
+        scales = self._box.comm.gather(K.scale)
+        if scales is not None:
             values = np.empty(len(self._box.cells))
-            values[self._box.cells] = np.concatenate(whole)
+            values[self._box.cells] = np.concatenate(scales)
             self._grids.update(values)
 
     def solve(

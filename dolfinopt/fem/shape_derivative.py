@@ -227,9 +227,9 @@ class ShapeDerivative:
             return by_nodes
         numbering = mesh.mesh.geometry.index_map()
         places = numbering.local_to_global(np.arange(len(by_nodes), dtype=np.int32))
-        whole = np.zeros((numbering.size_global, self._cell.dim))
-        whole[places] = by_nodes
-        return np.asarray(mesh.comm.allreduce(whole)[places])
+        by_all = np.zeros((numbering.size_global, self._cell.dim))
+        by_all[places] = by_nodes
+        return np.asarray(mesh.comm.allreduce(by_all)[places])
 
     @cached_property
     def _nodes(self) -> np.ndarray:

@@ -174,10 +174,10 @@ def compile_together(cell: forms.Cell) -> None:
     if not is_compiled(forms.stiffness(cell)[0]):
         centre, points = element_centre(cell), stress_points(cell)
         gauss, _ = gauss_points(cell, forms.geometric_degree(cell))
-        made = [forms.stiffness(cell), forms.mass(cell)]
-        made += [forms.stress_at(cell, places(at)) for at in (centre, points)]
-        made += [forms.geometric_factors(cell, places(gauss))]
-        compile_kernels([form for part in made for form in part])
+        parts = [forms.stiffness(cell), forms.mass(cell)]
+        parts += [forms.stress_at(cell, places(at)) for at in (centre, points)]
+        parts += [forms.geometric_factors(cell, places(gauss))]
+        compile_kernels([form for part in parts for form in part])
 
 
 def places(points: np.ndarray) -> tuple[tuple[float, ...], ...]:

@@ -89,9 +89,9 @@ def check_unit(points: np.ndarray, arm: Arm) -> None:
         raise InputError(f"{told}is its unit {name}? arms.mesh_scale = {unit * arm.mesh_scale:g}")
 
 
-def remedy(found: float, expected: float, keys: str) -> str:
+def remedy(size: float, expected: float, keys: str) -> str:
     """Return what to do about a length that is another one."""
-    if expected > 0.0 and 900.0 < found / expected < 1100.0:
+    if expected > 0.0 and 900.0 < size / expected < 1100.0:
         return "lengths are in metres, these look like millimetres"
     return f"correct the geometry, or {keys} in the scene"
 

@@ -183,13 +183,13 @@ def _has_elements(model: Any, dim: int, entity: int) -> bool:
     return any(map(len, model.mesh.getElements(dim, entity)[1]))
 
 
-def _check_interfaces(model: Any, found: Entities, names: list[str], arm: Arm) -> None:
+def _check_interfaces(model: Any, groups: Entities, names: list[str], arm: Arm) -> None:
     """Raise InputError where an interface is in no group of the file."""
     d, kind = (2, "faces") if arm.is_solid else (1, "curves")
     for tag, name in interface_names(arm).items():
-        if tag in bores_of(arm) or any(_has_elements(model, d, item) for item in found[tag]):
+        if tag in bores_of(arm) or any(_has_elements(model, d, item) for item in groups[tag]):
             continue
-        if found[tag]:
+        if groups[tag]:
             raise InputError(
                 f'the {kind} of group "{name}" carry no elements; save the mesh of all {kind}'
             )

@@ -409,10 +409,10 @@ class Wall:
     def thickness(self, comm: MPI.Comm, x: np.ndarray) -> np.ndarray:
         """Return the thickness (s, r) at the points of the hull, m (collective on the arm)."""
         along, around = self.hull.shape
-        whole = np.zeros(along * around)
-        whole[self.cells] = x
-        comm.Allreduce(MPI.IN_PLACE, whole)
-        share = (self._mean @ whole).reshape(-1, around)
+        all_shares = np.zeros(along * around)
+        all_shares[self.cells] = x
+        comm.Allreduce(MPI.IN_PLACE, all_shares)
+        share = (self._mean @ all_shares).reshape(-1, around)
         return np.asarray(self.least + (self.most - self.least) * share)
 
     @property
@@ -432,9 +432,9 @@ class Wall:
 
     def backward(self, by_points: np.ndarray) -> np.ndarray:
         """Return the derivative by x (n_cells,), given that by this rank's nodes (n, 3)."""
-        whole = np.zeros((2 * self.hull.outer[:, :, 0].size, 3))
-        whole[self.nodes] = by_points
-        by_share = self._mean.T @ self.hull.by_thickness(whole).ravel()
+        by_hull = np.zeros((2 * self.hull.outer[:, :, 0].size, 3))
+        by_hull[self.nodes] = by_points
+        by_share = self._mean.T @ self.hull.by_thickness(by_hull).ravel()
         return np.asarray((self.most - self.least) * by_share[self.cells])
 
 

@@ -84,8 +84,8 @@ def _interface(mesh: Abaqus, outer: np.ndarray, group: int, arm: Arm) -> np.ndar
     It is a surface or shells of its name, or the facets of `outer` within its nodes.
     """
 
-    def belongs(one: str) -> bool:
-        return interface_named(one, arm) == group
+    def belongs(name: str) -> bool:
+        return interface_named(name, arm) == group
 
     facets = [
         facet for surface in mesh.surfaces if belongs(surface) for facet in facets_of(mesh, surface)

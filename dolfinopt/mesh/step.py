@@ -49,26 +49,26 @@ def read_step(gmsh: Any, arm: Arm, unknown: list[str]) -> Entities:
     model = gmsh.model
     everywhere = _vertices(model, model.getEntities(1))
     check_unit(everywhere, arm)
-    found = no_groups(arm)
+    groups = no_groups(arm)
     if arm.is_solid:
-        _glue_solids(model, found)
+        _glue_solids(model, groups)
         named, lift = faces, 0.0
     else:
-        lift = _glue_faces(model, arm, faces, everywhere, found, unknown)
+        lift = _glue_faces(model, arm, faces, everywhere, groups, unknown)
         named = edges
     for tag in interface_names(arm):
         if tag not in bores_of(arm):
-            found[tag] = _interface(model, named, everywhere, tag, lift, arm)
+            groups[tag] = _interface(model, named, everywhere, tag, lift, arm)
     model.removePhysicalGroups()
     if arm.is_solid:
         mesh_volumes(gmsh, arm.cell_size, arm.cell_shape)
     else:
         gmsh.option.setNumber("Mesh.MeshSizeMax", arm.cell_size)
         mesh_surfaces(gmsh, arm.cell_shape or "quadrilateral")
-    return found
+    return groups
 
 
-def _glue_solids(model: Any, found: Entities) -> None:
+def _glue_solids(model: Any, groups: Entities) -> None:
     """Put the solids into their regions, glued: they do not share their common faces else."""
     solids = model.getEntities(3)
     if not solids:
@@ -79,7 +79,7 @@ def _glue_solids(model: Any, found: Entities) -> None:
         children = model.occ.fragment(solids, [])[1][: len(solids)]
         model.occ.synchronize()
     for name, parts in zip(names, children, strict=True):
-        found[group_named(name, PASSIVE) or DESIGN] += [tag for _, tag in parts]
+        groups[group_named(name, PASSIVE) or DESIGN] += [tag for _, tag in parts]
 
 
 def _glue_faces(
@@ -87,7 +87,7 @@ def _glue_faces(
     arm: Arm,
     named: StepShapes,
     everywhere: np.ndarray,
-    found: Entities,
+    entities: Entities,
     unknown: list[str],
 ) -> float:
     """Keep the planar faces, glued and in z = 0, put them into their regions; return their z, m."""
@@ -114,8 +114,8 @@ def _glue_faces(
     children = model.occ.fragment(faces, [])[1] if len(faces) > 1 else [[face] for face in faces]
     _remove_loose_curves(model)
     for groups, parts in zip(labels, children):
-        found[PASSIVE if PASSIVE in groups else DESIGN] += [tag for _, tag in parts]
-    found[DESIGN] = sorted(set(found[DESIGN]) - set(found[PASSIVE]))
+        entities[PASSIVE if PASSIVE in groups else DESIGN] += [tag for _, tag in parts]
+    entities[DESIGN] = sorted(set(entities[DESIGN]) - set(entities[PASSIVE]))
     return level
 
 
@@ -154,12 +154,12 @@ def _prism_faces(model: Any, arm: Arm) -> tuple[list[Entity], list[Entity], floa
 
 def _end_faces(model: Any, solid: Entity, arm: Arm) -> dict[Entity, float]:
     """Return the end faces of a prism along z, with their z, m."""
-    found, near = {}, FILE_ROUNDING_SHARE * arm.height
+    heights, near = {}, FILE_ROUNDING_SHARE * arm.height
     for face in model.getBoundary([solid], oriented=False):
         points, places = _sampled(model, face, 5)
         upright = np.abs(np.reshape(model.getNormal(face[1], places), (-1, 3))[:, 2])
         if (upright > 1.0 - FILE_ROUNDING_SHARE).all():
-            found[face] = float(points[:, 2].mean())
+            heights[face] = float(points[:, 2].mean())
         elif not (upright < FILE_ROUNDING_SHARE).all():
             x, y, z = model.occ.getCenterOfMass(*face)
             raise InputError(
@@ -167,8 +167,8 @@ def _end_faces(model: Any, solid: Entity, arm: Arm) -> dict[Entity, float]:
                 "normal to z nor along it; expected a section that is constant along z, or the "
                 "planar face in z = 0"
             )
-    bottom, top = min(found.values()), max(found.values())
-    steps = [z for z in found.values() if bottom + near < z < top - near]
+    bottom, top = min(heights.values()), max(heights.values())
+    steps = [z for z in heights.values() if bottom + near < z < top - near]
     if steps:
         raise InputError(
             f"it holds a solid with a step at z = {steps[0]:.6g} m between its end faces at "
@@ -180,7 +180,7 @@ def _end_faces(model: Any, solid: Entity, arm: Arm) -> dict[Entity, float]:
             f"its solid is {top - bottom:.6g} m thick along z, expected arms.thickness = "
             f"{arm.thickness:.6g} m; {remedy(top - bottom, arm.thickness, 'thickness')}"
         )
-    return found
+    return heights
 
 
 # -- interfaces ------------------------------------------------------------------------------
@@ -206,19 +206,19 @@ def _interface(
     dim = 2 if arm.is_solid else 1
     if any(map(belongs, shapes.names)):
         shift = np.array([0.0, 0.0, lift])
-        found = [
+        faces = [
             entity[1]
             for entity in model.getEntities(dim)
             if any(map(belongs, shapes.names_at(_vertices(model, [entity]) + shift, everywhere)))
         ]
-        if not found:
+        if not faces:
             kind, name = ("edges", "faces")[dim - 1], interface_names(arm)[tag]
             raise InputError(f'the {kind} named "{name}" are not where the file says')
-        return found
+        return faces
     names = list(interface_names(arm))
     x, y = ((0.0, 0.0), *(point[:2] for point in arm.interface_points))[names.index(tag)]
-    if found := (_bore if arm.is_solid else _circle)(model, x, y, arm):
-        return found
+    if faces := (_bore if arm.is_solid else _circle)(model, x, y, arm):
+        return faces
     ends = [
         entity[1]
         for entity in model.getEntities(dim)
@@ -251,20 +251,20 @@ def _radii(
     model: Any, dim: int, x: float, y: float, count: int, near: float
 ) -> list[tuple[float, np.ndarray, int]]:
     """Return radius, points and number of all curves or faces round (x, y), smallest first."""
-    found = []
+    radii = []
     for entity in model.getEntities(dim):
         points = _sampled(model, entity, count)[0]
         radius = np.linalg.norm(points[:, :2] - [x, y], axis=1)
         if np.ptp(radius) < near:
-            found.append((float(radius.mean()), points, entity[1]))
-    return sorted(found, key=lambda one: one[0])
+            radii.append((float(radius.mean()), points, entity[1]))
+    return sorted(radii, key=lambda entry: entry[0])
 
 
 def _bore(model: Any, x: float, y: float, arm: Arm) -> list[int]:
     """Return the faces of the smallest cylinder about the line along z through (x, y)."""
     near = FILE_ROUNDING_SHARE * arm.height
-    found = _radii(model, 2, x, y, 9, near)
-    return [tag for radius, _, tag in found if radius - found[0][0] < near]
+    radii = _radii(model, 2, x, y, 9, near)
+    return [tag for radius, _, tag in radii if radius - radii[0][0] < near]
 
 
 def _circle(model: Any, x: float, y: float, arm: Arm) -> list[int]:
@@ -354,8 +354,8 @@ def read_shapes(text: str) -> tuple[StepShapes, StepShapes]:
             name = re.match(r"\s*'([^']*)'", rest)
             if kind in kinds and name and name[1].strip():
                 names.append(name[1].strip().casefold())
-                found = sorted(_reach(instances, n))
-                vertices.append(np.reshape([points[k] for k in found], (-1, 3)))
+                numbers = sorted(_reach(instances, n))
+                vertices.append(np.reshape([points[k] for k in numbers], (-1, 3)))
         return StepShapes(names, vertices, everywhere)
 
     return shapes(_EDGES), shapes(_FACES)
@@ -374,15 +374,15 @@ def _point(instances: dict[int, tuple[str, str]], rest: str) -> list[float]:
 
 def _reach(instances: dict[int, tuple[str, str]], start: int) -> set[int]:
     """Return the vertices below a shape."""
-    found, ahead = set(), [start]
+    reached, ahead = set(), [start]
     while ahead:
         n = ahead.pop()
         kind, rest = instances.get(n, ("", ""))
         if kind == "VERTEX_POINT":
-            found.add(n)
+            reached.add(n)
         elif kind in _PATH:
             ahead += _references(rest)
-    return found
+    return reached
 
 
 def _extent(points: np.ndarray) -> float:

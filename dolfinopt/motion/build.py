@@ -516,17 +516,17 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
     by_child = {joint.child: joint for joint in scene.joints}
     joints, columns = [], scene.joint_columns
     for arm, coordinate, rotor in zip(scene.arms, columns, rotors_of(scene), strict=True):
-        one = by_child[arm.name]
-        parent, interface = place_of(scene, one.parent) or (GROUND, 0)
+        given = by_child[arm.name]
+        parent, interface = place_of(scene, given.parent) or (GROUND, 0)
         joints.append(
             Joint(
-                name=one.name,
-                kind=one.type,
+                name=given.name,
+                kind=given.type,
                 parent=parent,
                 coordinate=coordinate,
-                axis=_unit((0.0, 0.0, 1.0) if one.axis is None else one.axis),
-                origin=np.array(one.origin, dtype=float),
-                rotation=roll_pitch_yaw(one.rpy),
+                axis=_unit((0.0, 0.0, 1.0) if given.axis is None else given.axis),
+                origin=np.array(given.origin, dtype=float),
+                rotation=roll_pitch_yaw(given.rpy),
                 rotor=rotor,
                 interface=interface,
             )

@@ -277,7 +277,7 @@ class SiteMotion:
 
     def add_gradient(
         self,
-        found: list[dict[str, np.ndarray]],
+        by_bodies: list[dict[str, np.ndarray]],
         load: np.ndarray,
         working: np.ndarray,
         change: np.ndarray,
@@ -296,7 +296,7 @@ class SiteMotion:
             e, v = self.posed.q[:, mechanism.slices[link.body]], virtual[:, link.columns]
             rate, value = self.interface_load(link, working), self.interface_load(link, load)
             value = value + self.interface_load_along(link, working, change, virtual)
-            own, by_body = slice(b * link.number, b * (link.number + 1)), found[link.body]
+            own, by_body = slice(b * link.number, b * (link.number + 1)), by_bodies[link.body]
             by_body["outboard"][own] += value @ e + rate @ v
             if "K0_outboard" in by_body:
                 bent = 0.5 * value[:, None] * e.T + rate[:, None] * v.T

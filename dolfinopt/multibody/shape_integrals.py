@@ -152,9 +152,9 @@ class ShapeIntegrals:
 
     def padded(self, like: ShapeIntegrals) -> ShapeIntegrals:
         """Return derivatives by a `rigid_part` as those by the whole body: zero by its modes."""
-        whole = self.in_basis(np.zeros((0, like.num_modes)))
+        integrals = self.in_basis(np.zeros((0, like.num_modes)))
         zero: dict[str, Any] = {name: np.zeros_like(getattr(like, name)) for name in STIFFENING}
-        return replace(whole, **zero)
+        return replace(integrals, **zero)
 
     @property
     def first_frequency(self) -> float:

@@ -95,8 +95,8 @@ def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation
     arms, trajectory = evaluator.arms, evaluator.trajectory
     with together(evaluator.partition.world):
         result = {k: arms[k].contacts(x > 0.5) for k, x in x_phys.items()}
-    whole = all(item.joins for item in result.values())
-    if not evaluator.partition.world.allreduce(whole, MPI.MIN):
+    joined = all(item.joins for item in result.values())
+    if not evaluator.partition.world.allreduce(joined, MPI.MIN):
         return None
     cut = {k: np.where(item.kept, 1.0, 0.0) for k, item in result.items()}
     steps = sum(len(solution.a) for solution in trajectory.solutions) if trajectory else np.inf
@@ -108,21 +108,23 @@ def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation
 # -- comparison with solid arms and straight bars --------------------------------------------
 
 
-def evaluated_beside(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
+def evaluated_separately(
+    evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]
+) -> Evaluation | None:
     """Evaluate another design, of which the run knows nothing afterwards (collective).
 
     None where its motion cannot be simulated.
     """
-    one, scene = evaluator, evaluator.scene
-    arms = {k: arm.fresh() for k, arm in one.arms.items()}
+    own, scene = evaluator, evaluator.scene
+    arms = {k: arm.fresh() for k, arm in own.arms.items()}
     for k, arm in arms.items():
-        arm.coordinates = one.arms[k].coordinates
-        if (known := one.arms[k].stiffening) is not None:
+        arm.coordinates = own.arms[k].coordinates
+        if (known := own.arms[k].stiffening) is not None:
             arm.set_stiffening(known)
-    counts, result = replace(one.profile.counts), None
+    counts, result = replace(own.profile.counts), None
     with suppress(ConvergenceError):
-        result = evaluate(scene, one.partition, arms, x_phys, one.profile, simulated=False)[0]
-    one.profile.counts = counts
+        result = evaluate(scene, own.partition, arms, x_phys, own.profile, simulated=False)[0]
+    own.profile.counts = counts
     return result
 
 
@@ -135,7 +137,7 @@ def solid_limits(evaluator: Evaluator) -> tuple[Limit, ...]:
     if all(item.response.declared.of_nominal for item in constraints_of(scene)):
         return ()
     solid = uniform_design(scene, evaluator.partition, evaluator.arms, 1.0)
-    result = evaluated_beside(evaluator, solid)
+    result = evaluated_separately(evaluator, solid)
     return () if result is None else tuple(o for o in limits_of(scene, result) if not o.of_mass)
 
 
@@ -180,9 +182,11 @@ def _bar(arm: Arm, fraction: float) -> np.ndarray:
 
 def across(arm: Arm) -> np.ndarray:
     """Return how far cells are off the axis (n_cells, d - 1), in half sides of an arm's box."""
-    one = arm.scene.arms[arm.places[0]]
+    sizes = arm.scene.arms[arm.places[0]]
     return (
-        2.0 * arm.mesh.centroid[:, 1:] / np.array([one.height, one.thickness][: arm.mesh.dim - 1])
+        2.0
+        * arm.mesh.centroid[:, 1:]
+        / np.array([sizes.height, sizes.thickness][: arm.mesh.dim - 1])
     )
 
 

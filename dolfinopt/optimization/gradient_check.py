@@ -107,8 +107,8 @@ def taylor_test(
         along = float(slope @ d)
         remainders = tuple(abs(value(inside + h * d) - here - h * along) for h in STEPS)
         rate = _rate(remainders, ROUNDING_SHARE * abs(here))
-        beside = np.nan if frozen is None else float(frozen @ d)
-        rows.append(TaylorRow(name, along, beside, remainders, rate))
+        frozen_slope = np.nan if frozen is None else float(frozen @ d)
+        rows.append(TaylorRow(name, along, frozen_slope, remainders, rate))
     angle, ratio = (np.nan, np.nan) if frozen is None else compared(slope, frozen)
     return TaylorTest(tuple(rows), angle, ratio)
 

@@ -12,7 +12,7 @@ import numpy as np
 from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.optimization.assessment import (
     assess,
-    evaluated_beside,
+    evaluated_separately,
     solid_limits,
     solid_sentence,
     straight_bars,
@@ -181,7 +181,7 @@ class _Run:
             return None
         bars = straight_bars(self.evaluator, x_phys)
         with self.profile.phase("comparison"):
-            return None if bars is None else evaluated_beside(self.evaluator, bars)
+            return None if bars is None else evaluated_separately(self.evaluator, bars)
 
     def _finished(self) -> bool:
         """Decide whether to stop; the same on all ranks."""

@@ -139,8 +139,8 @@ def complement_solve(
     """
     weighted = pencil.mass(modes)
 
-    def lengths(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-        return pencil.total(np.einsum("nk,nk->k", one, other))
+    def lengths(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+        return pencil.total(np.einsum("nk,nk->k", left, right))
 
     def conditioned(R: np.ndarray) -> np.ndarray:
         """Return P B P' r, with P the projection into the complement; r becomes P' r."""
@@ -346,8 +346,8 @@ def _passes_over(pencil: Pencil, pairs: Pairs, start: np.ndarray) -> bool:
     rest = start - vectors @ pencil.total(pencil.mass(vectors).T @ start)
     both = pencil.mass(np.hstack([rest, start]))
     lengths = pencil.total(np.einsum("nk,nk->k", np.hstack([rest, start]), both))
-    left, whole = np.split(lengths, 2)
-    new = left >= LOST_MODE_SHARE * whole
+    left, total = np.split(lengths, 2)
+    new = left >= LOST_MODE_SHARE * total
     if not new.any():
         return False
     forces = both[:, : len(new)][:, new]

@@ -177,10 +177,10 @@ class Buckling(Response):
         return self.once(analysis, find)
 
     def _values(
-        self, analysis: Analysis, found: Mapping[int, list[Pressed]]
+        self, analysis: Analysis, pressed: Mapping[int, list[Pressed]]
     ) -> tuple[float, float, dict[int, list[np.ndarray]]]:
         """Return the largest 1 / factor, the p-norm, and by design its derivatives (collective)."""
-        mine = {k: [item.modes.inverse for item in each] for k, each in found.items()}
+        mine = {k: [item.modes.inverse for item in each] for k, each in pressed.items()}
         every = on_all_ranks(analysis.partition, mine)
         flat = [each for arm in every.values() for each in arm]
         values = np.maximum(np.concatenate([*flat, [1.0 / LARGEST_FACTOR]]), 0.0)
@@ -191,10 +191,10 @@ class Buckling(Response):
 
 
 def _gradient_of_arm(
-    state: DesignState, found: Sequence[Pressed], weights: Sequence[np.ndarray]
+    state: DesignState, pressed: Sequence[Pressed], weights: Sequence[np.ndarray]
 ) -> ArmGradient:
     """Differentiate by what one design's K0 is made of (collective on the arm's ranks)."""
-    counted = [(item, by) for item, by in zip(found, weights, strict=True) if by.any()]
+    counted = [(item, by) for item, by in zip(pressed, weights, strict=True) if by.any()]
     if not counted:
         return ArmGradient([], None, (Products(),))
     modes = np.concatenate([item.modes.field for item, _ in counted], axis=2)
@@ -204,21 +204,21 @@ def _gradient_of_arm(
     by_K0 = np.zeros((len(counted), len(mu), len(mu)))
     by_K0[instant, range(len(mu)), range(len(mu))] = -by_mu
     a, fields = np.array([item.a for item, _ in counted]), state.load_fields
-    one = Prestress(fields, stressed_modulus(state), a).gradient(modes, by_K0)
+    load_stress = Prestress(fields, stressed_modulus(state), a).gradient(modes, by_K0)
     pair = (modes * (-by_mu * mu), modes)
     by_loads = [
         ByLoads(to.motion, to.place, np.array([each.instant]), by[None] / to.stiffer)
-        for (each, _), by in zip(counted, one.by_a, strict=True)
+        for (each, _), by in zip(counted, load_stress.by_a, strict=True)
         for to in [each.loads]
     ]
-    beside = Products(
-        stiffness=(pair, (one.y, one.stress.u)),
-        mass=((-one.y, one.stress.inertia),),
-        places=one.places,
-        interfaces=partial(_at_interfaces, one, pair),
-        prestress=one,
+    products = Products(
+        stiffness=(pair, (load_stress.y, load_stress.stress.u)),
+        mass=((-load_stress.y, load_stress.stress.inertia),),
+        places=load_stress.places,
+        interfaces=partial(_at_interfaces, load_stress, pair),
+        prestress=load_stress,
     )
-    return ArmGradient(by_loads, one.through, (beside,))
+    return ArmGradient(by_loads, load_stress.through, (products,))
 
 
 def _at_interfaces(gradient: PrestressGradient, pair: Pair) -> tuple[np.ndarray, np.ndarray]:

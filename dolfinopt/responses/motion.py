@@ -225,7 +225,7 @@ class MotionResponse(Response):
 
         def followed() -> dict[int, Any]:
             weights = self._weights_of_scenarios(analysis.motion)
-            return over_motions(analysis, lambda _, one: self.cotangents(one), weights)
+            return over_motions(analysis, lambda _, response: self.cotangents(response), weights)
 
         by = on_root(world, followed)
         with together(world):
@@ -340,8 +340,8 @@ def second_moments(trajectory: Trajectory, cases: LoadCases) -> list[np.ndarray]
 def motion_objective(trajectory: Trajectory) -> MotionResponse | None:
     """Return the objective of the trajectory's scene; None where it is no motion's."""
     options = trajectory.scene.objective
-    one = find(options.kind)(options)
-    return one if isinstance(one, MotionResponse) else None
+    response = find(options.kind)(options)
+    return response if isinstance(response, MotionResponse) else None
 
 
 class PMean(MotionResponse):

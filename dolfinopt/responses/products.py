@@ -139,9 +139,9 @@ def by_nodes(state: DesignState, products: Products) -> np.ndarray:
         by_corners += shape.mass(left, right, elastic.density)
     if (stress := products.stress) is not None:
         by_corners += shape.stress(stress.points, stress.by_stress, stress.fields())
-    if (one := products.prestress) is not None:
+    if (prestress := products.prestress) is not None:
         by_corners += shape.geometric_stiffness(
-            one.stress.u, one.modes, one.by_K0, one.stress.modulus.value
+            prestress.stress.u, prestress.modes, prestress.by_K0, prestress.stress.modulus.value
         )
     by_points = np.zeros_like(elastic.points)
     if products.places is not None:

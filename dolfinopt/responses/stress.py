@@ -326,15 +326,15 @@ class Stress(Response):
         with together(analysis.partition.world):
             for k, item in result.items():
                 state = analysis.designs[k]
-                by_u, beside = _by_displacements(item, state)
+                by_u, products = _by_displacements(item, state)
                 if not len(every_instant(item.loads)):
-                    parts[k] = ArmGradient([], None, (replace(beside, stress=None),))
+                    parts[k] = ArmGradient([], None, (replace(products, stress=None),))
                 elif self.options.gradient == "esl":
-                    parts[k] = ArmGradient([], None, (beside, _frozen_loads(item, state, by_u)))
+                    parts[k] = ArmGradient([], None, (products, _frozen_loads(item, state, by_u)))
                 else:
                     with analysis.profile.phase("gradient"):
                         displaced = item.points.fields.gradient(every_instant(item.loads), by_u)
-                    parts[k] = ArmGradient(item.by_loads(displaced.by_a), displaced, (beside,))
+                    parts[k] = ArmGradient(item.by_loads(displaced.by_a), displaced, (products,))
         return [through_motions(analysis, parts)]
 
     def points_of(self, index: int, state: DesignState, fields: LoadFields) -> PointStress:
@@ -377,7 +377,7 @@ class Stress(Response):
             for k, point in points.items():
                 pairs = zip(by_owner[k], screened[k], strict=True)
                 by_owner[k] = [
-                    loads.at(found.counted[found.summed >= cut]) for loads, found in pairs
+                    loads.at(instants.counted[instants.summed >= cut]) for loads, instants in pairs
                 ]
                 a = every_instant(by_owner[k])
                 total = point.power_sum(a, largest, p) if largest else 0.0
@@ -437,9 +437,9 @@ class StressedDesign:
         ]
 
 
-def _by_displacements(found: StressedDesign, state: DesignState) -> tuple[np.ndarray, Products]:
+def _by_displacements(stressed: StressedDesign, state: DesignState) -> tuple[np.ndarray, Products]:
     """Differentiate by displacements of one arm, and by what else its stress is made of."""
-    points, sums, a = found.points, found.sums, every_instant(found.loads)
+    points, sums, a = stressed.points, stressed.sums, every_instant(stressed.loads)
     by, by_logs = np.zeros((*points.A.shape[:2], len(a))), np.zeros(len(points.weights))
     by_weights = np.zeros_like(by_logs)
     with state.elastic.profile.phase("stress"):
@@ -452,18 +452,18 @@ def _by_displacements(found: StressedDesign, state: DesignState) -> tuple[np.nda
             # Of total / weight, to the power 1 / p: a point's part in either is its weight
             # times a sum.
             np.divide(by_logs, points.weights, out=by_weights, where=counts)
-            by_weights -= sums.smooth / sums.weight * found.count
+            by_weights -= sums.smooth / sums.weight * stressed.count
             by_weights *= counts / p
-        by_u, beside = points.through(state, a, by, by_logs, by_weights)
-    return by_u, beside
+        by_u, products = points.through(state, a, by, by_logs, by_weights)
+    return by_u, products
 
 
-def _frozen_loads(found: StressedDesign, state: DesignState, by_u: np.ndarray) -> Products:
+def _frozen_loads(stressed: StressedDesign, state: DesignState, by_u: np.ndarray) -> Products:
     """Return what carries a change of the stiffness to displacements under held loads."""
     # With K u_n = f_n held, dJ = -sum_n lambda_n . dK u_n, K lambda_n = dJ/du_n.
     arm = state.elastic
     with arm.profile.phase("gradient"):
-        u = found.points.fields.displacements(every_instant(found.loads))
+        u = stressed.points.fields.displacements(every_instant(stressed.loads))
         pairs = ((-arm.static_response(*arm.restrict(by_u)), u),)
         return of_pairs(arm, pairs, direct=((by_u, u),))
 
@@ -500,7 +500,7 @@ class ArmGradient:
 
     by_loads: Sequence[ByLoads]
     displaced: DisplacementGradient | None
-    beside: tuple[Products, ...]
+    products: tuple[Products, ...]
 
 
 def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> CellGradient:
@@ -521,7 +521,7 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
     row = {}
     with together(partition.world):
         for k, item in mine.items():
-            by = [analysis.by(designs[k], each) for each in item.beside]
+            by = [analysis.by(designs[k], each) for each in item.products]
             if k in by_body:
                 by.append(exact_gradient(designs[k], by_body[k], item.displaced, analysis.by))
             row[k] = np.sum(by, axis=0)

@@ -134,10 +134,10 @@ def _of_design(
     places = places_of(operators, points).reshape(-1, state.mesh.dim)
     peaks, cells = [], []
 
-    def peak(found: Screened, places: np.ndarray) -> Peak:
-        known = comm.allgather(places[found.point] if found.point >= 0 else None)
+    def peak(screened: Screened, places: np.ndarray) -> Peak:
+        known = comm.allgather(places[screened.point] if screened.point >= 0 else None)
         place = next(item for item in known if item is not None)
-        return Peak(found.largest, tuple(map(float, place)), float(t[found.instant]))
+        return Peak(screened.largest, tuple(map(float, place)), float(t[screened.instant]))
 
     for item in every:
         a = item.coefficients
