@@ -28,6 +28,7 @@ from dolfinopt.scene.tables.design import Region, check_regions
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
     FRICTION_SPEED,
+    OF_PARTS,
     BearingDamping,
     BearingStiffness,
     Friction,
@@ -39,9 +40,9 @@ from dolfinopt.scene.tables.joints import (
     Point,
     RotorInertia,
     check_bores,
+    check_dampers,
     check_interfaces,
     check_motor,
-    check_parts,
     check_plane_bearing,
     in_frame,
 )
@@ -155,7 +156,10 @@ class Arm(Table):
         Use("wall min_wall max_wall ribs", "hollow"),
         Use("mass inertia centre", "rigid"),
         Use("mesh_size cell_shape mesh_scale", "mesh"),
+        *OF_PARTS,
     )
+    IN_SPACE = "centre interfaces"
+    NUMBERS = "inertia"
 
     name: Annotated[str, AfterValidator(check_arm_name)] = setting(
         "unique name, used in files and messages [-]"
@@ -350,8 +354,7 @@ class Arm(Table):
                 "hollow",
             )
         for key in ("extruded", "regions", "interfaces"):
-            if getattr(self, key):
-                raise Refusal("expected none with hollow = true", key, "hollow")
+            self.refuse_stated(key, "with hollow = true", "hollow")
         if self.element not in (None, "incompatible"):
             raise Refusal(
                 'expected "incompatible" with hollow = true: others lock in a wall of one layer',
@@ -434,7 +437,7 @@ class Arm(Table):
 
     @model_validator(mode="after")
     def _check_joint(self) -> Arm:
-        check_parts(self, "arms")
+        check_dampers(self)
         return self
 
     @property
@@ -686,11 +689,8 @@ class Arm(Table):
         )
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse a name that is taken, and what does not fit the arm whose design it has."""
+        """Refuse files of one name, and what does not fit the arm whose design it has."""
         before = scene.arms[: at[-1]]
-        # Some file systems do not tell capitals apart.
-        if self.name.casefold() in (arm.name.casefold() for arm in before):
-            raise Refusal("expected a name that no other arm has", ".name")
         if not scene.is_spatial:
             self._check_files(before)
             check_plane_bearing(self)
@@ -743,18 +743,12 @@ class Arm(Table):
                     )
 
     def _check_inertia(self, scene: Scene) -> None:
-        """Refuse what a rigid arm in the plane cannot have, and inertia that no body has."""
-        plane = "without [[joints]]: the machine moves in the plane"
-        if scene.is_spatial:
-            if problem := tensor_problem(self.inertia):
-                raise Refusal(problem, ".inertia")
-            return
-        if self.length == 0.0:
-            raise Refusal(f"expected more than 0 {plane}", ".length")
-        if isinstance(self.inertia, tuple):
-            raise Refusal(f"expected a number {plane}", ".inertia")
-        if self.centre is not None:
-            raise Refusal(f"expected none {plane}", ".centre")
+        """Refuse an arm in the plane without length, and inertia that no body has."""
+        if problem := tensor_problem(self.inertia):
+            raise Refusal(problem, ".inertia")
+        if self.length == 0.0 and not scene.is_spatial:
+            reason = "expected more than 0 without [[joints]]: the machine moves in the plane"
+            raise Refusal(reason, ".length")
 
     def _refuse_design(self, names: list[str], hint: str = "") -> None:
         allowed = " | ".join(map(shown, names)) or "no arm before it has one"

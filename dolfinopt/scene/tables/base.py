@@ -108,6 +108,12 @@ class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
 
     USES: ClassVar[tuple[Use, ...]] = ()
+    # Keys, separated by spaces, that have an effect in the plane alone; with [[joints]] alone;
+    # whose value in the plane is a number; whose value has one for every direction.
+    IN_PLANE: ClassVar[str] = ""
+    IN_SPACE: ClassVar[str] = ""
+    NUMBERS: ClassVar[str] = ""
+    VECTORS: ClassVar[str] = ""
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -158,9 +164,38 @@ class Table(BaseModel):
             Refusal: they do not agree.
         """
         try:
+            self._check_name(scene, at)
+            self._check_dimension(scene)
             self.check_in_scene(scene, at)
         except Refusal as refusal:
             raise refusal.below(at) from None
+
+    def _check_name(self, scene: Scene, at: Loc) -> None:
+        """Refuse the name of an earlier entry; some file systems do not tell capitals apart."""
+        table, *places = at
+        own = getattr(self, "name", None)
+        if own is None or not places:
+            return
+        before = getattr(scene, table)[: places[0]]
+        if own.casefold() in [str(entry.name).casefold() for entry in before]:
+            raise Refusal(f"expected a name that no other {table[:-1]} has", ".name")
+
+    def _check_dimension(self, scene: Scene) -> None:
+        """Refuse keys, and shapes of values, that the machine has no use for."""
+        spatial = scene.is_spatial
+        where = "with [[joints]]: the machine moves in space"
+        if not spatial:
+            where = "without [[joints]]: the machine moves in the plane"
+        for key in (self.IN_PLANE if spatial else self.IN_SPACE).split():
+            self.refuse_stated(f".{key}", where, "joints")
+        for key in self.NUMBERS.split():
+            if isinstance(getattr(self, key), tuple) and not spatial:
+                raise Refusal(f"expected a number {where}", f".{key}")
+        numbers = "three numbers" if spatial else "two numbers"
+        for key in self.VECTORS.split():
+            value = getattr(self, key)
+            if value != type(self).model_fields[key].default and len(value) != scene.dimension:
+                raise Refusal(f"expected an array of {numbers} {where}", f".{key}")
 
     @model_validator(mode="after")
     def _check_uses(self) -> Self:
@@ -176,9 +211,10 @@ class Table(BaseModel):
         return self
 
     def refuse_stated(self, key: str, reason: str, *others: str) -> None:
-        """Raise if a key has not its default; `reason` goes on after "expected none"."""
-        default = type(self).model_fields[key].default
-        if getattr(self, key) != default:
+        """Raise if a key, of any path, has not its default; `reason` goes on after it."""
+        name = key.rpartition(".")[2]
+        default = type(self).model_fields[name].default
+        if getattr(self, name) != default:
             expected = "none" if default is None else f"{shown(default)}, the default,"
             raise Refusal(f"expected {expected} {reason}", key, *others)
 

@@ -147,9 +147,7 @@ class Closures(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
-        taken = [joint.name for joint in scene.joints]
-        taken += [closure.name for closure in scene.closures[: at[-1]]]
-        if self.name.casefold() in map(str.casefold, taken):
+        if self.name.casefold() in [joint.name.casefold() for joint in scene.joints]:
             raise Refusal("expected a name that no joint or other closure has", ".name")
         self._check_ends(scene)
         if scene.is_spatial:
@@ -161,9 +159,8 @@ class Closures(Table):
         """Refuse what a loop in space cannot be combined with."""
         if self.kind == "pin" and self.axis is None:
             raise Refusal("expected an array of three numbers with a pin", ".axis")
-        for key in ("point", "axis"):
-            if len(getattr(self, key) or ()) == 2:
-                raise Refusal("expected an array of three numbers with [[joints]]", f".{key}")
+        if self.axis is not None and len(self.axis) == 2:
+            raise Refusal("expected an array of three numbers with [[joints]]", ".axis")
         if self.is_spring and scene.control is not None:
             raise Refusal(
                 "expected 0 with [control]: a driven rod has its drive's gains there",

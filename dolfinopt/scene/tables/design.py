@@ -17,7 +17,6 @@ from dolfinopt.scene.tables.base import (
     Table,
     Use,
     setting,
-    shown,
 )
 
 if TYPE_CHECKING:
@@ -221,26 +220,17 @@ class Design(Table):
     def _check_hollow(self, scene: Scene) -> None:
         """Refuse what walls have no use for."""
         hollow = [i for i in scene.designed if scene.arms[i].hollow]
-        if hollow and self.projection:
-            raise Refusal(
-                "expected false with a hollow arm: a wall may have any thickness",
-                "design.projection",
-                f"arms.{hollow[0]}.hollow",
-            )
-        if not hollow or len(hollow) < len(scene.designed):
+        if not hollow:
             return
-        rows = [("interpolation", key) for key in type(scene.interpolation).model_fields]
-        for table, key in (("design", "initial"), *rows):
-            one = getattr(scene, table)
-            default = type(one).model_fields[key].default
-            if getattr(one, key) != default:
-                words = {"initial": "arms.wall is the initial thickness"}
-                raise Refusal(
-                    f"expected {shown(default)}, the default, where all arms are hollow: "
-                    f"{words.get(key, 'cells are solid')}",
-                    f"{table}.{key}",
-                    f"arms.{hollow[0]}.hollow",
-                )
+        at = f"arms.{hollow[0]}.hollow"
+        self.refuse_stated(".projection", "with a hollow arm: a wall may have any thickness", at)
+        if len(hollow) < len(scene.designed):
+            return
+        for key in type(scene.interpolation).model_fields:
+            reason = "where all arms are hollow: cells are solid"
+            scene.interpolation.refuse_stated(f"interpolation.{key}", reason, at)
+        reason = "where all arms are hollow: arms.wall is the initial thickness"
+        self.refuse_stated(".initial", reason, at)
 
     def _check_member_width(self, scene: Scene) -> None:
         for i in scene.designed if self.controls_widths else ():

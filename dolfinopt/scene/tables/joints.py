@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from dolfinopt.scene.tables.base import Length, Position, Refusal, Table, setting, shown
+from dolfinopt.scene.tables.base import Length, Position, Refusal, Table, Use, setting, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -109,11 +109,6 @@ def check_interfaces(scene: Scene, index: int) -> None:
     arm = scene.arms[index]
     if not arm.interfaces:
         return
-    if not scene.is_spatial:
-        raise Refusal(
-            "expected none without [[joints]]: an arm in the plane carries the next one at its end",
-            ".interfaces",
-        )
     if arm.pattern is not None:
         raise Refusal(
             "expected none with the design of another arm, scaled", ".interfaces", ".design"
@@ -323,30 +318,22 @@ OUT_OF_PLANE = {2: "along z", 3: "about x", 4: "about y"}
 
 
 class _Table(Protocol):
-    gear_stiffness: float
-    gear_damping: float
     bearing_stiffness: _Six | None
     bearing_damping: _Six | None
-    friction: tuple[float, float] | None
-    friction_speed: float
 
 
-def check_parts(one: _Table, table: str) -> None:
-    """Refuse dampers without a spring, and a speed of no friction; `table` is arms or joints."""
-    if one.gear_damping > 0.0 and one.gear_stiffness == 0.0:
-        raise Refusal(
-            f"expected 0 without {table}.gear_stiffness, beside whose spring the damper acts",
-            "gear_damping",
-            "gear_stiffness",
-        )
-    if one.friction is None and one.friction_speed != FRICTION_SPEED:
-        raise Refusal(f"expected none without {table}.friction", "friction_speed")
-    springs = one.bearing_stiffness or (0.0,) * 6
-    for i, damper in enumerate(one.bearing_damping or ()):
+# What a joint has with another part alone.
+OF_PARTS = (Use("gear_damping", "gear_stiffness"), Use("friction_speed", "friction"))
+
+
+def check_dampers(table: _Table) -> None:
+    """Refuse dampers of a bearing in directions without a spring."""
+    springs = table.bearing_stiffness or (0.0,) * 6
+    for i, damper in enumerate(table.bearing_damping or ()):
         if damper > 0.0 and springs[i] == 0.0:
             raise Refusal(
-                f"expected 0 as number {i + 1}: {table}.bearing_stiffness has no spring there, "
-                "beside which the damper would act",
+                f"expected 0 as number {i + 1}: bearing_stiffness has no spring there, beside "
+                "which the damper would act",
                 "bearing_damping",
                 "bearing_stiffness",
             )

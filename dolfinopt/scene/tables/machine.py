@@ -22,6 +22,7 @@ from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
     FRICTION_SPEED,
     OF_BEARINGS,
+    OF_PARTS,
     BearingDamping,
     BearingStiffness,
     Friction,
@@ -30,8 +31,8 @@ from dolfinopt.scene.tables.joints import (
     GearRatio,
     GearStiffness,
     RotorInertia,
+    check_dampers,
     check_direction,
-    check_parts,
     check_site,
     check_used,
     joint_parts,
@@ -52,8 +53,6 @@ OF_MOVING = ("axis", "passive", "position_limits", "velocity_limit", "effort_lim
              *(key for key in DRIVE_KEYS if key not in OF_BEARINGS))  # fmt: skip
 GROUND = "ground"
 PATHS = ("joints", "points", "line")  # of machines in space
-# What a machine in the plane has instead of joints.
-PLANE_KEYS = ("base", "cart_follow", "cart_mass", "joint_height", "elbow")
 
 
 def check_joint_name(name: str) -> str:
@@ -66,7 +65,7 @@ def check_joint_name(name: str) -> str:
 class Joint(Table):
     """A joint between the ground or an arm's outboard interface and the arm that it holds."""
 
-    USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"),)
+    USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"), *OF_PARTS)
 
     name: Annotated[str, AfterValidator(check_joint_name)] = setting(
         "unique name, the column of its coordinate in tables [-]"
@@ -137,7 +136,7 @@ class Joint(Table):
 
     @model_validator(mode="after")
     def _check_parts(self) -> Joint:
-        check_parts(self, "joints")
+        check_dampers(self)
         return self
 
     @model_validator(mode="after")
@@ -149,14 +148,12 @@ class Joint(Table):
         return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse names that are taken or unknown; with the first joint, all that joints rule out.
+        """Refuse names that are unknown; with the last joint, all that joints rule out.
 
         Raises:
             Refusal: its keys are paths from the scene.
         """
         before = scene.joints[: at[-1]]
-        if self.name.casefold() in (joint.name.casefold() for joint in before):
-            raise Refusal("expected a name that no other joint has", ".name")
         names = [arm.name for arm in scene.arms]
         if self.child not in names:
             allowed = " | ".join(map(shown, names))
@@ -205,12 +202,9 @@ def _check_tree(scene: Scene) -> None:
 
 def _check_passive(scene: Scene) -> None:
     """Refuse joints without drives where no loop moves them."""
-    for i, joint in enumerate(scene.joints):
-        at = f"joints.{i}.passive"
-        if joint.passive and not scene.closures:
-            raise Refusal(
-                "expected false, the default, without [[closures]]: no loop moves the joint", at
-            )
+    for i, joint in enumerate(scene.joints if not scene.closures else ()):
+        reason = "without [[closures]]: no loop moves the joint"
+        joint.refuse_stated(f"joints.{i}.passive", reason)
 
 
 def _check_machine(scene: Scene) -> None:
@@ -224,35 +218,11 @@ def _check_machine(scene: Scene) -> None:
             raise Refusal(
                 "expected an array of three numbers with [[joints]]", f"motion.{key}", "joints"
             )
-    movable = scene.movable
-    if motion.path == "joints" and motion.initial_joints is not None and not scene.closures:
-        raise Refusal(
-            'expected none with motion.path = "joints", which does not use it without [[closures]]',
-            "motion.initial_joints",
-            "motion.path",
-        )
-    if motion.initial_joints is not None and len(motion.initial_joints) != len(movable):
-        names = ", ".join(joint.name for joint in movable)
-        raise Refusal(f"expected {len(movable)} numbers, of {names}", "motion.initial_joints")
-    for key in PLANE_KEYS:
-        default = type(motion).model_fields[key].default
-        if getattr(motion, key) != default:
-            raise Refusal(
-                f"expected {shown(default)}, the default, with [[joints]], which say where the "
-                "machine stands",
-                f"motion.{key}",
-                "joints",
-            )
-    if len(motion.gravity) == 2 and any(motion.gravity):
-        raise Refusal(
-            "expected an array of three numbers with [[joints]]", "motion.gravity", "joints"
-        )
-    if scene.objective.elbow_angle is not None:
-        raise Refusal(
-            "expected none with [[joints]]: links vibrate in the pose at the middle of the motion",
-            "objective.elbow_angle",
-            "joints",
-        )
+    key = "motion.initial_joints"
+    if motion.path == "joints" and not scene.closures:
+        reason = 'with motion.path = "joints", which does not use it without [[closures]]'
+        motion.refuse_stated(key, reason, "motion.path")
+    refuse_count(motion.initial_joints, [joint.name for joint in scene.movable], key)
     for k, arm in enumerate(scene.arms):
         if arm.flexible and not arm.is_solid:
             raise Refusal(
@@ -331,6 +301,8 @@ class Damping(Table):
 class Payload(Table):
     """What the end-effector carries."""
 
+    IN_SPACE = "offset arm"
+    NUMBERS = "inertia"
     mass: float = setting("point mass at the end-effector [kg]", ge=0, le=1e9)
     inertia: Moment | Tensor = setting(
         0.0,
@@ -352,23 +324,13 @@ class Payload(Table):
         return self.inertia[2] if isinstance(self.inertia, tuple) else self.inertia
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse a tensor that no body has, and what a payload in the plane does not have."""
-        if not scene.is_spatial:
-            if isinstance(self.inertia, tuple):
-                raise Refusal(
-                    "expected a number without [[joints]]: the machine moves in the plane",
-                    ".inertia",
-                )
-            if any(self.offset):
-                raise Refusal("expected [0, 0, 0], the default, without [[joints]]", ".offset")
-            if self.arm is not None:
-                raise Refusal("expected none without [[joints]]: the last arm carries it", ".arm")
-            return
+        """Refuse a tensor that no body has, and a place that no arm has."""
         if problem := tensor_problem(self.inertia):
             raise Refusal(problem, ".inertia")
         if self.arm is not None:
             check_site(scene, self.arm, ".arm")
-        check_used(scene)
+        if scene.is_spatial:
+            check_used(scene)
 
 
 # -- given forces ----------------------------------------------------------------------------
@@ -387,6 +349,8 @@ FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 class Force(Table):
     """A force and a moment on an interface of an arm, constant or from a table over time."""
 
+    NUMBERS = "moment"
+    VECTORS = "force"
     name: Annotated[str, AfterValidator(check_joint_name)] | None = setting(
         None, "unique name, by which changes may call it [-]"
     )
@@ -432,22 +396,10 @@ class Force(Table):
         return self.moment if isinstance(self.moment, tuple) else (self.moment,)
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Refuse what acts nowhere, has another dimension, or a key that nothing uses."""
-        if self.name and self.name in [force.name for force in scene.forces[: at[-1]]]:
-            raise Refusal("expected a name that no other force has", ".name")
+        """Refuse what acts nowhere, or a key that nothing uses."""
         check_site(scene, self.arm, ".arm")
-        where = "with [[joints]]" if scene.is_spatial else "without [[joints]]: in the plane"
-        if self.force is not None and len(self.force) != scene.dimension:
-            numbers = "three numbers" if scene.is_spatial else "two numbers"
-            raise Refusal(f"expected an array of {numbers} {where}", ".force")
-        if self.moment is not None and isinstance(self.moment, tuple) != scene.is_spatial:
-            expected = "an array of three numbers" if scene.is_spatial else "a number"
-            raise Refusal(f"expected {expected} {where}", ".moment")
-        if not self.feed_forward and (
-            scene.control is None or scene.control.feed_forward == "none"
-        ):
-            raise Refusal(
-                "expected true, the default, without a feed-forward: "
-                '[control] with feed_forward = "rigid"',
-                ".feed_forward",
-            )
+        if scene.is_spatial and isinstance(self.moment, float):
+            raise Refusal("expected an array of three numbers with [[joints]]", ".moment")
+        if scene.control is None or scene.control.feed_forward == "none":
+            reason = 'without a feed-forward: [control] with feed_forward = "rigid"'
+            self.refuse_stated(".feed_forward", reason)

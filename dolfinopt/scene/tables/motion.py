@@ -17,6 +17,7 @@ from dolfinopt.scene.tables.base import (
     Refusal,
     Table,
     Use,
+    refuse_count,
     setting,
     shown,
 )
@@ -46,6 +47,9 @@ PROFILES = ("trapezoidal", "s-curve")  # laws that are shaped by the limits
 class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
 
+    IN_PLANE = "base cart_follow cart_mass joint_height elbow"
+    IN_SPACE = "rpy"
+    VECTORS = "gravity start end"
     USES = (
         Use("radius flattening", "path", "arc"),
         Use("start end rpy", "path", "line"),
@@ -274,31 +278,13 @@ class Motion(Table):
         self._check_limits()
         if scene.is_spatial:
             return  # `tables.joints` knows
-        if self.path in ("joints", "rotation") and not scene.closures and self.elbow != -1:
-            raise Refusal(
-                f"expected -1, the default, with path = {shown(self.path)}: no path is followed, "
-                "and without [[closures]] no loop is put together",
-                "motion.elbow",
-                "motion.path",
-            )
-        for key in ("gravity", "start", "end"):
-            if len(getattr(self, key)) == 3:
-                raise Refusal(
-                    "expected an array of two numbers without [[joints]]: the machine moves in "
-                    "the plane",
-                    f"motion.{key}",
-                )
-        for key in ("rpy", *([] if scene.closures else ["initial_joints"])):
-            if getattr(self, key) is not None:
-                raise Refusal(
-                    "expected none without [[joints]]: the machine moves in the plane",
-                    f"motion.{key}",
-                )
-        if self.initial_joints is not None and len(self.initial_joints) != len(scene.arms):
-            raise Refusal(
-                f"expected {len(scene.arms)} numbers, the angles of all arms' joints",
-                "motion.initial_joints",
-            )
+        if not scene.closures:
+            if self.path in ("joints", "rotation"):
+                reason = f"with path = {shown(self.path)}: no path is followed, and no loop closed"
+                self.refuse_stated(".elbow", reason, ".path")
+            reason = "without [[joints]]: elbow says which solution is meant"
+            self.refuse_stated(".initial_joints", reason)
+        refuse_count(self.initial_joints, [arm.name for arm in scene.arms], ".initial_joints")
         independent = len(scene.arms) - scene.dependent_joints
         if self.path == "rotation" and independent > 1:
             raise Refusal(
@@ -315,12 +301,8 @@ class Motion(Table):
                 "motion.base",
                 "motion.path",
             )
-        if self.cart_follow != type(self).model_fields["cart_follow"].default:
-            raise Refusal(
-                "expected 0.5, the default, with one arm: the path determines the position "
-                "of the cart",
-                "motion.cart_follow",
-            )
+        reason = "with one arm: the path determines the position of the cart"
+        self.refuse_stated(".cart_follow", reason)
 
     def _check_designed_law(self, scene: Scene) -> None:
         """Refuse what a law with variables cannot be combined with."""

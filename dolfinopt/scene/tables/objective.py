@@ -55,6 +55,8 @@ Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 class Objective(Table):
     """What is minimised."""
 
+    IN_PLANE = "elbow_angle"
+
     kind: ObjectiveKind = setting(
         "esl",
         'minimised response, "esl" being the compliance of the load cases; or '
@@ -222,26 +224,14 @@ class Objective(Table):
                 "objective.modes",
                 "objective.kind",
             )
-        fields = type(self).model_fields
-        for key in unused_options(fields, self.kind, scene.limits):
-            default = fields[key].default
-            if getattr(self, key) == default:
-                continue
+        for key in unused_options(type(self).model_fields, self.kind, scene.limits):
             objectives, limits = users_of(key)
             users = f"objective.kind = {' or '.join(map(shown, objectives))}"
             users += "".join(f", or constraints.{name}" for name in limits)
-            expected = "none" if default is None else f"{shown(default)}, the default,"
-            raise Refusal(
-                f"expected {expected} without {users}: nothing else uses it",
-                f"objective.{key}",
-                "objective.kind",
-            )
-        if not scene.scenarios and self.scenarios != fields["scenarios"].default:
-            raise Refusal(
-                f"expected {shown(fields['scenarios'].default)}, the default, without "
-                "[[scenarios]]: there are none to combine",
-                "objective.scenarios",
-            )
+            self.refuse_stated(f".{key}", f"without {users}: nothing else uses it", ".kind")
+        if not scene.scenarios:
+            reason = "without [[scenarios]]: there are none to combine"
+            self.refuse_stated(".scenarios", reason)
 
     def _check_weights(self, scene: Scene) -> None:
         if self.effort_weights is None:
@@ -374,9 +364,8 @@ class ConstraintOptions(Table):
         used = [response.name for response in asked(scene) if "poles_at" in response.options]
         options = ("damping_below", "poles_at")
         for key in unused_options(options, scene.objective.kind, self.limits):
-            if getattr(self, key) is not None:
-                users = " or ".join(f"constraints.{name}" for name in users_of(key)[1])
-                raise Refusal(f"expected none without {users}: nothing else uses it", f".{key}")
+            users = " or ".join(f"constraints.{name}" for name in users_of(key)[1])
+            self.refuse_stated(f".{key}", f"without {users}: nothing else uses it")
         if not used:
             return
         where = f".{used[0]}" if used[0] in self.limits else "objective.kind"
