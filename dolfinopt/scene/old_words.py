@@ -5,7 +5,6 @@ The tree is the scene as read, before it is validated: values of any type may st
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -19,37 +18,49 @@ Tree = dict[str, Any]
 Row = dict[str, Any]
 
 
+# Tree, row of the older key, key of now and the older value; returns that of now, None: none.
+Translation = Callable[[Tree, Row, str, Any], Any]
+
+
+def _same(tree: Tree, row: Row, key: str, value: Any) -> Any:
+    return value
+
+
 @dataclass(frozen=True)
 class OldWord:
     """An older key.
 
     Attributes:
         old: dotted key.
-        new: what it is now, for people.
-        translate: takes tree, row and value and puts the value in its place; None: no effect.
+        new: dotted key of now; "": it has no effect.
+        value: what that has.
+        words: what it is now, for people, where `new` does not say it.
         default: value that it had where it was not stated, which is not told.
     """
 
     old: str
     new: str
-    translate: Callable[[Tree, Row, Any], None] | None = None
+    value: Translation = _same
+    words: str = ""
     default: Any = None
 
+    @property
+    def told(self) -> str:
+        """What it is now, for people."""
+        return self.words or self.new
 
-def _renamed(key: str) -> Callable[[Tree, Row, Any], None]:
-    def translate(tree: Tree, row: Row, value: Any) -> None:
-        row[key] = value
+    @property
+    def is_renamed(self) -> bool:
+        """Whether it is another name of a key of the same table."""
+        return not self.words and self.new.partition(".")[0] == self.old.partition(".")[0]
 
-    return translate
-
-
-def _scaled(key: str) -> Callable[[Tree, Row, Any], None]:
-    """Multiply the numbers of an array."""
-
-    def translate(tree: Tree, row: Row, value: Any) -> None:
-        row[key] = scaled(row.get(key), value)
-
-    return translate
+    def put(self, tree: Tree, row: Row, value: Any) -> None:
+        """Put the value of a row of its table in the place of now."""
+        table, key = self.new.split(".")
+        result = self.value(tree, row, key, value)
+        target = row if table == self.old.partition(".")[0] else tree.setdefault(table, {})
+        if result is not None:
+            target[key] = result
 
 
 def scaled(value: Any, factor: Any) -> Any:
@@ -61,124 +72,103 @@ def scaled(value: Any, factor: Any) -> Any:
     return float(value) * factor if is_number and not isinstance(value, bool) else value
 
 
-def _of_site(key: str) -> Callable[[Tree, Row, Any], None]:
-    """Add an interface to the name of its arm: "arm.interface"."""
-
-    def translate(tree: Tree, row: Row, value: Any) -> None:
-        arm = row.get(key)
-        if arm is None:
-            arm = next((item.get("name") for item in reversed(rows(tree, "arms"))), "")
-        row[key] = site_of(str(arm))[0]
-        if str(value).casefold() != OUTBOARD:
-            row[key] += f".{value}"
-
-    return translate
+def _scaled(tree: Tree, row: Row, key: str, value: Any) -> Any:
+    return scaled(row.get(key), value)
 
 
-def _symmetric_z(tree: Tree, row: Row, value: Any) -> None:
+def _site(tree: Tree, row: Row, key: str, value: Any) -> str:
+    """Return "arm.interface" of the arm that a row states, else of the last one."""
+    arm = row.get(key)
+    if arm is None:
+        arm = next((item.get("name") for item in reversed(rows(tree, "arms"))), "")
+    name = site_of(str(arm))[0]
+    return name if str(value).casefold() == OUTBOARD else f"{name}.{value}"
+
+
+def _symmetric_z(tree: Tree, row: Row, key: str, value: Any) -> Any:
     arms = rows(tree, "arms")
-    before = arms[max(0, arms.index(row) - 1)] if "symmetric" not in row else row
-    about_y = before.get("symmetric") in (True, "yz")
-    row["symmetric"] = ("yz" if about_y else "z") if value else about_y
+    before = arms[max(0, arms.index(row) - 1)] if key not in row else row
+    about_y = before.get(key) in (True, "yz")
+    return ("yz" if about_y else "z") if value else about_y
 
 
-def _frequencies(method: str) -> Callable[[Tree, Row, Any], None]:
-    def translate(tree: Tree, row: Row, value: Any) -> None:
-        if row.get("method") == method:
-            row["frequencies"] = value
-
-    return translate
+def _only_with(key: str, *values: Any) -> Translation:
+    """Return the translation of a key that has an effect with some values of another one alone."""
+    return lambda tree, row, _, value: value if row.get(key) in values else None
 
 
-def _bore(name: str) -> Callable[[Tree, Row, Any], None]:
-    def translate(tree: Tree, row: Row, value: Any) -> None:
+def _bore(name: str) -> Translation:
+    def interfaces(tree: Tree, row: Row, key: str, value: Any) -> list[Row]:
         given = value if isinstance(value, Mapping) else {}
-        others = row.get("interfaces") or []
+        others = row.get(key) or []
         known: Row = next((other for other in others if other.get("name") == name), {})
-        row["interfaces"] = [{"name": name, **known, **given}]
-        row["interfaces"] += [other for other in others if other.get("name") != name]
+        first = {"name": name, **known, **given}
+        return [first, *(other for other in others if other.get("name") != name)]
 
-    return translate
-
-
-def _fixed_at(tree: Tree, row: Row, value: Any) -> None:
-    if row.get("base") == "fixed":
-        row["base"] = value
+    return interfaces
 
 
-def _steps(tree: Tree, row: Row, value: Any) -> None:
-    if row.get("optimize") is True:
-        row["optimize"] = value
+def _way(tree: Tree, row: Row, key: str, value: Any) -> Any:
+    return None if tree.get("joints") else value
 
 
-def _of_motion(key: str) -> Callable[[Tree, Row, Any], None]:
-    def translate(tree: Tree, row: Row, value: Any) -> None:
-        tree.setdefault("motion", {})[key] = value
-
-    return translate
+def _eroded(tree: Tree, row: Row, key: str, value: Any) -> str | None:
+    return f"robust-{value}" if row.get(key) == "robust" and value != "nominal" else None
 
 
-def _way(tree: Tree, row: Row, value: Any) -> None:
-    if not tree.get("joints"):
-        tree.setdefault("motion", {})["elbow"] = value
+def _first_mode(tree: Tree, row: Row, key: str, value: Any) -> Any:
+    return "first" if value is True else value or None
 
 
-def _eroded(tree: Tree, row: Row, value: Any) -> None:
-    if row.get("projection") == "robust" and value != "nominal":
-        row["projection"] = f"robust-{value}"
+def _exact(tree: Tree, row: Row, key: str, value: Any) -> str | None:
+    return "exact" if value else None
 
 
-def _first_mode(tree: Tree, row: Row, value: Any) -> None:
-    if value:
-        row["modes"] = "first" if value is True else value
-
-
-def _exact(tree: Tree, row: Row, value: Any) -> None:
-    if value:
-        tree.setdefault("objective", {})
-        for objective in rows(tree, "objective"):
-            objective["gradient"] = "exact"
-
-
+BY_RADAU = "every motion is integrated by Radau IIA"
+CURVES = "parts have lines, arcs and circles"
 OLD_WORDS = (
-    OldWord("arms.joint_stiffness", "arms.gear_stiffness", _renamed("gear_stiffness"), 0.0),
-    OldWord("arms.joint_damping", "arms.gear_damping", _renamed("gear_damping"), 0.0),
-    OldWord(
-        "arms.symmetric_z", 'arms.symmetric = "z", "yz" about both planes', _symmetric_z, False
-    ),
-    OldWord("arms.pattern", "arms.design", _renamed("design")),
-    OldWord("arms.hull", "arms.hollow = its file", _renamed("hollow")),
-    OldWord("arms.section", "arms.hollow = the section", _renamed("hollow")),
-    OldWord("arms.inboard_bore", 'an entry "inboard" of [[arms.interfaces]]', _bore(INBOARD)),
-    OldWord("arms.outboard_bore", 'an entry "outboard" of [[arms.interfaces]]', _bore(OUTBOARD)),
-    OldWord(
-        "joints.parent_interface", 'joints.parent = "arm.interface"', _of_site("parent"), OUTBOARD
-    ),
-    OldWord("payload.interface", 'payload.arm = "arm.interface"', _of_site("arm"), OUTBOARD),
-    OldWord("forces.interface", 'forces.arm = "arm.interface"', _of_site("arm"), OUTBOARD),
-    OldWord("closures.direction", "closures.axis", _renamed("axis")),
-    OldWord("reduction.shifts", "reduction.frequencies", _frequencies("krylov"), [0.0]),
-    OldWord("reduction.band", "reduction.frequencies", _frequencies("balanced"), [0.0, 50.0]),
-    OldWord("control.stiffness_factor", "control.stiffness times it", _scaled("stiffness"), 1.0),
-    OldWord("control.damping_factor", "control.damping times it", _scaled("damping"), 1.0),
-    OldWord("optimizer.exact_iterations", 'objective.gradient = "exact"', _exact, 0),
-    OldWord("simulation.integrator", "every motion is integrated by Radau IIA", None, "radau"),
-    OldWord("design.limits_on", 'design.projection = "robust-eroded"', _eroded, "nominal"),
-    OldWord("objective.follow", 'objective.modes = "first"', _first_mode, False),
+    OldWord("arms.joint_stiffness", "arms.gear_stiffness", default=0.0),
+    OldWord("arms.joint_damping", "arms.gear_damping", default=0.0),
+    OldWord("arms.symmetric_z", "arms.symmetric", _symmetric_z,
+            'arms.symmetric = "z", "yz" about both planes', False),
+    OldWord("arms.pattern", "arms.design"),
+    OldWord("arms.hull", "arms.hollow", words="arms.hollow = its file"),
+    OldWord("arms.section", "arms.hollow", words="arms.hollow = the section"),
+    OldWord("arms.inboard_bore", "arms.interfaces", _bore(INBOARD),
+            'an entry "inboard" of [[arms.interfaces]]'),
+    OldWord("arms.outboard_bore", "arms.interfaces", _bore(OUTBOARD),
+            'an entry "outboard" of [[arms.interfaces]]'),
+    OldWord("joints.parent_interface", "joints.parent", _site,
+            'joints.parent = "arm.interface"', OUTBOARD),
+    OldWord("payload.interface", "payload.arm", _site, 'payload.arm = "arm.interface"', OUTBOARD),
+    OldWord("forces.interface", "forces.arm", _site, 'forces.arm = "arm.interface"', OUTBOARD),
+    OldWord("closures.direction", "closures.axis"),
+    OldWord("reduction.shifts", "reduction.frequencies", _only_with("method", "krylov"),
+            default=[0.0]),
+    OldWord("reduction.band", "reduction.frequencies", _only_with("method", "balanced"),
+            default=[0.0, 50.0]),
+    OldWord("control.stiffness_factor", "control.stiffness", _scaled,
+            "control.stiffness times it", 1.0),
+    OldWord("control.damping_factor", "control.damping", _scaled, "control.damping times it", 1.0),
+    OldWord("optimizer.exact_iterations", "objective.gradient", _exact,
+            'objective.gradient = "exact"', 0),
+    OldWord("simulation.integrator", "", words=BY_RADAU, default="radau"),
+    OldWord("design.limits_on", "design.projection", _eroded,
+            'design.projection = "robust-eroded"', "nominal"),
+    OldWord("objective.follow", "objective.modes", _first_mode, 'objective.modes = "first"', False),
     OldWord("closures.side", "motion.elbow", _way),
-    OldWord("motion.base_position", "motion.base = the number", _fixed_at, 0.0),
-    OldWord("constraints.path_speed", "motion.max_speed", _of_motion("max_speed")),
-    OldWord(
-        "constraints.path_acceleration", "motion.max_acceleration", _of_motion("max_acceleration")
-    ),
-    OldWord("constraints.path_jerk", "motion.max_jerk", _of_motion("max_jerk")),
-    OldWord("part.iterations", "part.optimize = the number", _steps, 80),
-    OldWord("simulation.stages", "steps have four stages", None, 4),
-    OldWord("part.curves", "parts have lines, arcs and circles", None, "splines"),
-    OldWord("part.simplify", "parts have lines, arcs and circles", None, False),
-    OldWord("simulation.rho_inf", "every motion is integrated by Radau IIA", None, 0.8),
-    *(OldWord(f"constraints.{old}", f"constraints.{key}", _renamed(key))
-      for old, key in OLD_LIMITS.items()),
+    OldWord("motion.base_position", "motion.base", _only_with("base", "fixed"),
+            "motion.base = the number", 0.0),
+    OldWord("constraints.path_speed", "motion.max_speed"),
+    OldWord("constraints.path_acceleration", "motion.max_acceleration"),
+    OldWord("constraints.path_jerk", "motion.max_jerk"),
+    OldWord("part.iterations", "part.optimize", _only_with("optimize", True),
+            "part.optimize = the number", 80),
+    OldWord("simulation.stages", "", words="steps have four stages", default=4),
+    OldWord("part.curves", "", words=CURVES, default="splines"),
+    OldWord("part.simplify", "", words=CURVES, default=False),
+    OldWord("simulation.rho_inf", "", words=BY_RADAU, default=0.8),
+    *(OldWord(f"constraints.{old}", f"constraints.{key}") for old, key in OLD_LIMITS.items()),
 )  # fmt: skip
 OLD_KEYS = {word.old for word in OLD_WORDS}
 
@@ -186,12 +176,14 @@ OLD_KEYS = {word.old for word in OLD_WORDS}
 def in_new_words(key: str) -> str:
     """Return a dotted key in the words of now, as --set takes it; one of now as it is."""
     key = closures.in_new_words(key)
-    place, dot, name = key.rpartition(".")
+    place, _, name = key.rpartition(".")
     table = place.partition(".")[0]
     word = next((item for item in OLD_WORDS if item.old == f"{table}.{name}"), None)
-    if word is not None and (result := re.fullmatch(r"[a-z]+\.([a-z_]+)( times it)?", word.new)):
-        name = result[1] + ("*" if result[2] else "")
-    return place + dot + name
+    if word is not None and word.value is _scaled:
+        return f"{place}.{word.new.rpartition('.')[2]}*"
+    if word is None or word.words:
+        return key
+    return f"{place}.{word.new.rpartition('.')[2]}" if word.is_renamed else word.new
 
 
 def rows(tree: Mapping[str, Any], key: str) -> list[Row]:
@@ -219,14 +211,15 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
                 continue
             value = row.pop(key)
             unset = value is None or _plain(value) == word.default
-            if value is not None and word.translate is not None and (anew or not unset):
-                if not anew:
+            if word.new and value is not None:
+                if not anew and not unset:
                     _refuse_both(row, word, source)
-                word.translate(tree, row, value)
-            elif value is not None and word.translate is not None and table == "arms":
-                _keep(tree, row, word, value)
-            if not unset or (anew and word.translate is not None):
-                told.append(f"{word.old} is read as {word.new}")
+                # Of what an arm states the default counts, too: the arm before may have another.
+                stated = table == "arms" and word.new.rpartition(".")[2] not in row
+                if anew or not unset or stated:
+                    word.put(tree, row, value)
+            if not unset or (anew and word.new):
+                told.append(f"{word.old} is read as {word.told}")
     for row in rows(tree, "objective"):
         kind = row.get("kind")
         if isinstance(kind, str) and kind in OLD_KINDS:
@@ -239,17 +232,10 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _keep(tree: Tree, row: Row, word: OldWord, value: Any) -> None:
-    """Put a stated default in its place, which the arm before may not have: it is taken over."""
-    key = word.new.partition(".")[2].partition(" ")[0]
-    if key not in row and word.translate is not None:
-        word.translate(tree, row, value)
-
-
 def _refuse_both(row: Row, word: OldWord, source: str) -> None:
     """Refuse a scene that states a value by the newer word, too."""
-    table, _, key = word.new.partition(".")
-    if table in word.old and row.get(key) not in (None, 0.0):
+    key = word.new.rpartition(".")[2]
+    if word.is_renamed and row.get(key) not in (None, 0.0):
         raise InputError(
             f"{source}: {word.old}: expected only one of it and {word.new}: they are the same"
         )
