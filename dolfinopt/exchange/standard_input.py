@@ -310,7 +310,7 @@ def load_body(
             other interfaces.
     """
     further = further or {}
-    body = from_sid(sid.read_sid(path), dimension, further=tuple(further), source=str(path))
+    body = from_sid(sid.read_sid(path), dimension, tuple(further), str(path))
     if length is None:
         return body
     axis: Place = (length, 0.0, 0.0)
@@ -345,21 +345,18 @@ def without_stiffening(body: ShapeIntegrals, source: str) -> ShapeIntegrals:
 def from_sid(
     data: sid.StandardInputData,
     dimension: int,
-    inboard: str | None = None,
-    outboard: str | None = None,
     further: Sequence[str] = (),
     source: str = "SID",
 ) -> ShapeIntegrals:
     """Return the body of standard input data.
 
-    The frame must be the tangent frame at the inboard node. In the plane all motion must be in x-y;
-    entries that such motion does not feel (J about x and y, ...) are dropped.
+    The frame must be the tangent frame at the inboard node, the first one; the last one is the
+    outboard interface. In the plane all motion must be in x-y; entries that such motion does not
+    feel (J about x and y, ...) are dropped.
 
     Args:
         data: of any program.
         dimension: 2 for a body in the plane, 3 in space.
-        inboard: name of the inboard node, by default the first.
-        outboard: name of the outboard node, by default the last.
         further: names of the nodes that are further interfaces.
         source: what messages call the data.
 
@@ -368,7 +365,7 @@ def from_sid(
             of the plane, initial stresses, geometric stiffening by some loads only, no matrices of
             the first order in Oe of a body in space, matrices that are no mechanical body's.
     """
-    first, last = _ends(data, inboard, outboard, source)
+    first, last = _ends(data, source)
     tips = [last, *(_named(data, name, source) for name in further)]
     _check_nodes(first, tips, dimension, source)
     _check_body(data, dimension, source)
@@ -477,10 +474,8 @@ def _centrifugal_excess(data: sid.StandardInputData, dimension: int) -> np.ndarr
 # -- what standard input data must fulfil ------------------------------------------------------
 
 
-def _ends(
-    data: sid.StandardInputData, inboard: str | None, outboard: str | None, source: str
-) -> tuple[sid.Node, sid.Node]:
-    """Return the two interface nodes of a body that bends; by default the first and the last."""
+def _ends(data: sid.StandardInputData, source: str) -> tuple[sid.Node, sid.Node]:
+    """Return the two interface nodes of a body that bends: the first and the last."""
     if data.num_modes == 0:
         raise InputError(
             f"{source}: nelastq = 0, a body that does not bend; state rigid = true, mass and "
@@ -492,14 +487,7 @@ def _ends(
             f"{source}: lacks an outboard node, its nodes are: {', '.join(names) or 'none'}; an "
             "arm needs an inboard node at the origin and an outboard node"
         )
-    for side, name in (("inboard", inboard), ("outboard", outboard)):
-        if name is not None and name not in names:
-            raise InputError(f"{source}: no {side} node {name!r}; it has {', '.join(names)}")
-    first = data.nodes[0 if inboard is None else names.index(inboard)]
-    last = data.nodes[-1 if outboard is None else names.index(outboard)]
-    if first is last:
-        raise InputError(f"{source}: node {first.name} cannot be both inboard and outboard")
-    return first, last
+    return data.nodes[0], data.nodes[-1]
 
 
 def _named(data: sid.StandardInputData, name: str, source: str) -> sid.Node:

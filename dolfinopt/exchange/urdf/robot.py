@@ -199,28 +199,8 @@ class Robot:
             link = result[0].parent
         return tuple(result)
 
-    def poses(self, q: dict[str, float]) -> dict[str, np.ndarray]:
-        """Return the pose of every link's frame in the root's at joint coordinates by name."""
-        poses = {self.root: np.eye(4)}
-        for joint in self.joints:
-            own = motion_of(joint.kind, joint.axis, q[joint.name]) if joint.moves else np.eye(4)
-            poses[joint.child] = poses[joint.parent] @ joint.pose @ own
-        return poses
-
 
 # -- frames ----------------------------------------------------------------------------------
-
-
-def motion_of(kind: str, axis: np.ndarray, q: float) -> np.ndarray:
-    """Return the pose that a joint's coordinate makes."""
-    out = np.eye(4)
-    if kind == "prismatic":
-        out[:3, 3] = q * axis
-    else:
-        x, y, z = axis
-        cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        out[:3, :3] += math.sin(q) * cross + (1.0 - math.cos(q)) * cross @ cross
-    return out
 
 
 def pose_of(R: np.ndarray, place: np.ndarray) -> np.ndarray:
@@ -624,8 +604,7 @@ class _Reader:
 
     def _place(self, key: str, link: str, point: Sequence[float]) -> tuple[str, np.ndarray]:
         """Return the body's link, or the ground, and a point's pose in its outboard frame."""
-        at = np.eye(4)
-        at[:3, 3] = point
+        at = pose_of(np.eye(3), np.asarray(point))
         if link == GROUND:
             return GROUND, at
         if link not in self.places:
@@ -633,9 +612,8 @@ class _Reader:
         body, pose = self.places[link]
         if body == GROUND or not self.bodies[body].is_solid:
             return body, pose @ at
-        one = self.bodies[body]
-        end = one.frame.copy()
-        end[:3, 3] += one.length * end[:3, 0]
+        solid = self.bodies[body]
+        end = solid.frame @ pose_of(np.eye(3), np.array([solid.length, 0.0, 0.0]))
         result = inverse(end) @ pose @ at
         if np.linalg.norm(result[:3, 3]) > SAME_PLACE:
             raise _refused(
