@@ -6,7 +6,6 @@ import itertools
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -426,16 +425,16 @@ def _links(world: MPI.Comm, run: _Run) -> _Links:
     from dolfinopt.part.folder import SCENE
     from dolfinopt.part.part import make_parts
 
-    made = run.folder / PARTS
-    if not on_root(world, lambda: (made / SCENE).is_file() and not stale_parts(made)):
+    folder = run.folder / PARTS
+    if not on_root(world, lambda: (folder / SCENE).is_file() and not stale_parts(folder)):
         parts = make_parts(run.scene, run.folder, world=world)
         owners = dict(zip((arm.name for arm in run.scene.arms), run.scene.owners, strict=True))
         return {name: (run.bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
-    machine: Scene = on_root(world, load_scene, made / SCENE)
-    bodies = _reduced(world, made, machine, None).bodies
+    machine: Scene = on_root(world, load_scene, folder / SCENE)
+    bodies = _reduced(world, folder, machine, None).bodies
     if world.rank:
         return {}
-    files = {item.name: made / f"{_owner(run.scene, item.name)}.stl" for item in machine.arms}
+    files = {item.name: folder / f"{_owner(run.scene, item.name)}.stl" for item in machine.arms}
     return {
         item.name: (bodies[k], _surface(files[item.name]))
         for k, item in enumerate(machine.arms)
@@ -473,14 +472,14 @@ def _reduced(world: MPI.Comm, run: Path, scene: Scene, design: str | None = "des
 
 def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
     """Write all files, the robot last: where it is, the others belong to it (root only)."""
-    from dolfinopt.disk import working_in, write_atomically
+    from dolfinopt.disk import working_in, write_bytes
     from dolfinopt.output.folders import prepare_folder, remove_stale
 
     prepare_folder(folder)
     with working_in(folder):
         remove_stale(folder, [robot, *PAGES])
         for name, data in files.items():
-            write_atomically(folder / name, partial(_put, data))
+            write_bytes(folder / name, data)
 
 
 # -- before and after ------------------------------------------------------------------------
@@ -562,10 +561,6 @@ def _robot_files(
     files[origin.file.name] = robot_text(origin.file, links, folder)
     said.append(f"the robot with these links: {folder / origin.file.name}")
     return files, said
-
-
-def _put(data: bytes, stream: object) -> None:
-    stream.write(data)  # type: ignore[attr-defined]
 
 
 def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:

@@ -148,13 +148,13 @@ def _fits(info: KeyInfo, pattern: str | None) -> bool:
     return any(pattern in path for path in paths)
 
 
-def _materials(pattern: str | None, found: list[KeyInfo]) -> list[str]:
+def _materials(pattern: str | None, infos: list[KeyInfo]) -> list[str]:
     """Return a line for every material of the catalogue whose name, or whose key, was asked for."""
     from dolfinopt.scene.materials import CATALOGUE
 
     if pattern is None:
         return []
-    asked = any(info.key == "material.name" for info in found)
+    asked = any(info.key == "material.name" for info in infos)
     word = pattern.casefold()
     rows = [
         f"{name:<24}{_in_units(material.young_modulus, 1e9):>9} GPa{material.poisson_ratio:>7.3g}"

@@ -131,26 +131,26 @@ def part(
         except PartsError as error:  # what there is of the others is of use
             if error.parts:
                 say("files")
-                Made(scene, error.parts, None).write(folder, target, plots)
+                PartsJob(scene, error.parts, None).write(folder, target, plots)
                 names = ", ".join(item.name for item in error.parts.values())
                 warn([f"only files of {names} in {target}"])
             raise
         with together(world):
             if world.rank == 0:
                 warn(dict.fromkeys(text for item in parts.values() for text in item.warnings))
-                made = Made(scene, parts, _meshes(parts, check or bool(asked.optimize), say))
-                made = made.checked(folder, say) if check else made
-                if asked.optimize and made.meshes is not None:
-                    made = made.optimized(folder, asked, check, say, kept.replace, known)
+                done = PartsJob(scene, parts, _meshes(parts, check or bool(asked.optimize), say))
+                done = done.checked(folder, say) if check else done
+                if asked.optimize and done.meshes is not None:
+                    done = done.optimized(folder, asked, check, say, kept.replace, known)
                 say("files")
-                made.write(folder, target, plots)
-                if made.shape is None or not made.shape.interrupted:
+                done.write(folder, target, plots)
+                if done.shape is None or not done.shape.interrupted:
                     kept.remove()
     if world.rank == 0:
-        made.tell(target)
-        if made.meshes is None:
+        done.tell(target)
+        if done.meshes is None:
             raise ConvergenceError("a part cannot be meshed: there is no part.toml")
-        if made.shape is not None and made.shape.interrupted:
+        if done.shape is not None and done.shape.interrupted:
             raise KeyboardInterrupt(
                 f"the best parts so far are in {target}; to go on, add --resume"
             )
@@ -183,8 +183,8 @@ def _meshes(parts: Mapping[int, Part], coarse: bool, say: Say) -> Meshes | None:
 
 
 @dataclass(frozen=True, eq=False)
-class Made:
-    """What the command has made so far, on the root.
+class PartsJob:
+    """What the command has come to so far, on the root.
 
     Attributes:
         scene: of the run.
@@ -200,7 +200,7 @@ class Made:
     check: Check | None = None
     shape: Optimized | None = None
 
-    def checked(self, run: Path, say: Say) -> Made:
+    def checked(self, run: Path, say: Say) -> PartsJob:
         """Return it with what the parts do, or a warning where that cannot be simulated.
 
         What is known is of the parts before, which stand beside these.
@@ -218,7 +218,7 @@ class Made:
 
     def optimized(
         self, run: Path, asked: Asked, check: bool, say: Say, keep: Keep, known: Sequence[Saved]
-    ) -> Made:
+    ) -> PartsJob:
         """Return it with optimised shapes, the parts before beside them in the check."""
         from dolfinopt.part.optimize import optimize_parts
 

@@ -195,13 +195,13 @@ def _details(summary: Summary) -> Iterator[str]:
 
 def _next(result: Result, summary: Summary, folder: Path) -> str:
     """Return how to go on from a design."""
-    scene, made = result.scene, result.scene.optimizer.max_iterations
-    more = 2 * made or type(scene.optimizer)().max_iterations
+    scene, iterations = result.scene, result.scene.optimizer.max_iterations
+    more = 2 * iterations or type(scene.optimizer)().max_iterations
     longer = (
         f"dolfinopt optimize {scene.source} --out {folder} --resume "
         f"--set optimizer.max_iterations={more}"
     )
-    if made == 0:
+    if iterations == 0:
         return f"next: {longer}"
     if result.violated:
         spent = result.stop_code is StopCode.ITERATIONS

@@ -567,13 +567,13 @@ def _check_body(data: sid.StandardInputData, dimension: int, source: str) -> Non
 
 def _check_plane(data: sid.StandardInputData, inertia: np.ndarray, source: str) -> None:
     """Check that plane motion stays in the plane."""
-    for name, values, whole in (
+    for name, values, matrix in (
         ("row 3 of mdCM", data.mdCM.M0[2], data.mdCM.M0),
         ("J(1, 3), J(2, 3)", inertia[:2, 2], inertia),
         ("column 3 of Ct", data.Ct.M0[:, 2], data.Ct.M0),
         ("columns 1, 2 of Cr", data.Cr.M0[:, :2], data.Cr.M0),
     ):
-        if np.abs(values).max() > FILE_ROUNDING_SHARE * np.abs(whole).max():
+        if np.abs(values).max() > FILE_ROUNDING_SHARE * np.abs(matrix).max():
             raise InputError(
                 f"{source}: {name} reach(es) {np.abs(values).max():.3g}; an arm must move in the "
                 "x-y plane only"

@@ -199,7 +199,7 @@ def placed(gmsh: Any, groups: Entities, arm: Arm) -> Entities:
     for group, bore in bores.items():
         facets[group] = _of_bore(points, outer, bore, interface_names(arm)[group])
     if (frame := frame_of(arm)) is not None:
-        points = (points - np.array(frame[0])) @ np.array(frame[1]).T
+        points = (points - frame[0]) @ frame[1].T
     return into_model(gmsh, SolidCells(points, cells, facets), dim)
 
 

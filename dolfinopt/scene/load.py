@@ -555,19 +555,18 @@ def _store(tree: dict[str, Any], loc: Loc, value: Any) -> None:
 #
 # The tree is the scene as read, before it is validated: values of any type may stand in it.
 
-Keys = tuple[tuple[str, str], ...]
+Keys = Iterator[tuple[str, str]]  # table and key of what has been completed
 
 
-def complete(tree: dict[str, Any]) -> Keys:
+def complete(tree: dict[str, Any]) -> tuple[tuple[str, str], ...]:
     """Complete lengths, times of the motion, number of coordinates, volume's limit and gradient.
 
     Returns:
         The keys that follow from others, as (table, key).
     """
-    measured = _measure_path(tree)  # by which the path's least duration is known
-    timed = _time_motion(tree)
-    others = _count_coordinates(tree), _limit_volume(tree), _freeze_loads(tree)
-    return *measured, *timed, *(key for keys in others for key in keys)
+    # Lengths first, by which the path's least duration is known.
+    steps = _measure_path, _time_motion, _count_coordinates, _limit_volume, _freeze_loads
+    return tuple(key for step in steps for key in step(tree))
 
 
 FILTERED = 1.0 / 8.0  # radius of the filter over the height of the lowest arm
@@ -575,7 +574,7 @@ SHOULDER, ARC = -0.25, 0.5  # place of the shoulder and radius of the arc over t
 
 
 def _measure_path(tree: dict[str, Any]) -> Keys:
-    """Complete lengths of path and filter, and the way of a loop; return their (table, key)."""
+    """Complete lengths of path and filter, and the way of a loop."""
     lengths, heights = (_sizes(rows(tree, "arms"), key) for key in ("length", "height"))
     motion, design = tree.get("motion"), tree.setdefault("design", {})
     result: dict[tuple[str, str], float] = {}
@@ -587,10 +586,10 @@ def _measure_path(tree: dict[str, Any]) -> Keys:
             result["motion", "radius"] = ARC * sum(lengths)
     if heights and not (design.get("minimum_member") or design.get("minimum_gap")):
         result["design", "filter_radius"] = FILTERED * min(heights)
-    derived = [key for key in result if key[1] not in tree[key[0]]]
-    for table, key in derived:
-        tree[table][key] = result[table, key]
-    return tuple(derived)
+    for (table, key), value in result.items():
+        if key not in tree[table]:
+            tree[table][key] = value
+            yield table, key
 
 
 def _sizes(arms: Iterable[Mapping[str, Any]], key: str) -> list[float]:
@@ -600,16 +599,14 @@ def _sizes(arms: Iterable[Mapping[str, Any]], key: str) -> list[float]:
 
 
 def _count_coordinates(tree: dict[str, Any]) -> Keys:
-    """Give solid arms six coordinates an interface; return (table, key) if it was not stated."""
+    """Give solid arms six coordinates an interface."""
     reduction, usual = tree.get("reduction", {}), Reduction.model_fields["method"].default
     if "coordinates" in reduction or reduction.get("method", usual) != usual:
-        return ()
+        return
     solids = filter(_is_solid, rows(tree, "arms"))
-    counts = [6 * (1 + len(rows(arm, "interfaces"))) for arm in solids]
-    if not counts:
-        return ()
-    tree["reduction"] = {**reduction, "coordinates": max(counts)}
-    return (("reduction", "coordinates"),)
+    if counts := [6 * (1 + len(rows(arm, "interfaces"))) for arm in solids]:
+        tree["reduction"] = {**reduction, "coordinates": max(counts)}
+        yield "reduction", "coordinates"
 
 
 def _is_solid(arm: Mapping[str, Any]) -> bool:
@@ -621,12 +618,10 @@ def _is_solid(arm: Mapping[str, Any]) -> bool:
 
 
 def _time_motion(tree: dict[str, Any]) -> Keys:
-    """Complete duration and horizon where they follow from others; return their (table, key)."""
-    if not (motion := tree.get("motion")):
-        return ()
-    asked = ("file", *LIMITS)
-    derived: list[tuple[str, str]] = []
-    if motion.get("duration") is None and any(motion.get(key) is not None for key in asked):
+    """Complete duration and horizon where they follow from others."""
+    motion = tree.get("motion") or {}
+    limited = any(motion.get(key) is not None for key in ("file", *LIMITS))
+    if limited and motion.get("duration") is None:
         from dolfinopt.scene.duration import least_duration  # NumPy, only needed here
 
         rest = {key: motion[key] for key in motion if key not in ("duration", "horizon")}
@@ -636,38 +631,33 @@ def _time_motion(tree: dict[str, Any]) -> Keys:
             least = None
         if least:  # of a table with one row the motion tells
             motion["duration"] = least
-            derived.append(("motion", "duration"))
+            yield "motion", "duration"
     duration = motion.get("duration")
-    default = Motion.model_fields["horizon"].default
-    moving = motion.get("table_ends") == "moving"
     if "horizon" in motion or not isinstance(duration, (int, float)):
-        return tuple(derived)
-    if duration > default or moving:
+        return
+    moving = motion.get("table_ends") == "moving"
+    if duration > Motion.model_fields["horizon"].default or moving:
         motion["horizon"] = duration
-        derived.append(("motion", "horizon"))
-    return tuple(derived)
+        yield "motion", "horizon"
 
 
 def _limit_volume(tree: dict[str, Any]) -> Keys:
-    """Leave out the volume's limit where mass is asked for; return (table, key) if not stated."""
+    """Leave out the volume's limit where mass is asked for."""
     design, limits = tree["design"], tree.get("constraints", {})
     if design.get("volume_fraction") is not None:
-        return ()
+        return
     design.pop("volume_fraction", None)
     if tree.get("objective", {}).get("kind") == "mass" or limits.get("mass") is not None:
         design["volume_fraction"] = None
-    return (("design", "volume_fraction"),)
+    yield "design", "volume_fraction"
 
 
 def _freeze_loads(tree: dict[str, Any]) -> Keys:
-    """Hold the loads in the gradient of "esl" without limits of the motion; return (table, key)."""
+    """Hold the loads in the gradient of "esl" without limits of the motion."""
     objective, limits = tree.get("objective", {}), tree.get("constraints", {})
-    if "gradient" in objective:
-        return ()
     limited = [key for key, limit in limits.items() if limit is not None]
-    if objective.get("kind", Objective.model_fields["kind"].default) != "esl" or any(
-        response.key in limited and "motion" in response.needs for response in DECLARED.values()
-    ):
-        return ()
-    tree["objective"] = {**objective, "gradient": "esl"}
-    return (("objective", "gradient"),)
+    kind = objective.get("kind", Objective.model_fields["kind"].default)
+    followed = (item.key for item in DECLARED.values() if "motion" in item.needs)
+    if "gradient" not in objective and kind == "esl" and not {*followed}.intersection(limited):
+        tree["objective"] = {**objective, "gradient": "esl"}
+        yield "objective", "gradient"

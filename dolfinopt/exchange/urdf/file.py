@@ -62,9 +62,9 @@ def read_robot(file: Path, package_path: Sequence[Path] = ()) -> Robot:
             ) from None
         _check_names(file, "link", [link.name for link in model.links])
         _check_names(file, "joint", [joint.name for joint in model.joints])
-        joints = [_joint(file, one) for one in model.joints]
+        joints = [_joint(file, item) for item in model.joints]
         _check_mimics(file, joints)
-        links = {one.name: _link(file, one, package_path) for one in model.links}
+        links = {item.name: _link(file, item, package_path) for item in model.links}
     root, ordered = _ordered(file, list(links), joints)
     return Robot(model.name, file, links, ordered, root)
 
@@ -74,13 +74,13 @@ def _quiet() -> Iterator[None]:
     """Keep what yourdfpy and trimesh log to themselves: errors are told in one line."""
     loggers = [logging.getLogger(name) for name in ("yourdfpy", "yourdfpy.urdf", "trimesh")]
     levels = [(logger, logger.level) for logger in loggers]
-    for one in loggers:
-        one.setLevel(logging.CRITICAL)
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        for one, level in levels:
-            one.setLevel(level)
+        for logger, level in levels:
+            logger.setLevel(level)
 
 
 def safe_xml(file: Path, **options: Any) -> Any:
@@ -143,38 +143,39 @@ def _check_names(file: Path, what: str, names: list[str]) -> None:
 # -- joints ----------------------------------------------------------------------------------
 
 
-def _joint(file: Path, one: Any) -> RobotJoint:
-    where = f"{file}: joint {one.name!r}"
-    if one.type not in (*MOVABLE, "fixed"):
+def _joint(file: Path, joint: Any) -> RobotJoint:
+    where = f"{file}: joint {joint.name!r}"
+    if joint.type not in (*MOVABLE, "fixed"):
         raise InputError(
-            f"{where}: type {one.type!r}; a scene has joints of type {', '.join(MOVABLE)} and fixed"
+            f"{where}: type {joint.type!r}; a scene has joints of type {', '.join(MOVABLE)} and "
+            "fixed"
         )
-    _check_finite(f"{where}: origin", _pose(one.origin))
-    axis = np.asarray(one.axis, dtype=float)
+    _check_finite(f"{where}: origin", _pose(joint.origin))
+    axis = np.asarray(joint.axis, dtype=float)
     length = np.linalg.norm(axis) if axis.shape == (3,) else 0.0
-    if one.type != "fixed" and not (math.isfinite(length) and length > 0.0):
+    if joint.type != "fixed" and not (math.isfinite(length) and length > 0.0):
         raise InputError(f"{where}: axis {axis.tolist()}; expected three numbers, not all zero")
-    limit = one.limit
+    limit = joint.limit
     lower, upper = -math.inf, math.inf
     stated = [] if limit is None else [x for x in (limit.lower, limit.upper) if x is not None]
-    if stated and one.type in ("revolute", "prismatic"):
+    if stated and joint.type in ("revolute", "prismatic"):
         lower, upper = limit.lower or 0.0, limit.upper or 0.0
         _check_finite(f"{where}: limit", stated)
         if lower > upper:
             raise InputError(f"{where}: limit lower = {lower:g} above upper = {upper:g}")
     rate, effort = (_limit(where, word, limit) for word in ("velocity", "effort"))
     unit = axis / length if length else np.array([1.0, 0.0, 0.0])
-    mimic = None if one.type == "fixed" or one.mimic is None else _mimic(one.mimic)
-    own = one.name, one.type, one.parent, one.child, _pose(one.origin), unit
-    return RobotJoint(*own, lower, upper, rate, effort, mimic, _friction(where, one))
+    mimic = None if joint.type == "fixed" or joint.mimic is None else _mimic(joint.mimic)
+    own = joint.name, joint.type, joint.parent, joint.child, _pose(joint.origin), unit
+    return RobotJoint(*own, lower, upper, rate, effort, mimic, _friction(where, joint))
 
 
-def _friction(where: str, one: Any) -> tuple[float, float]:
+def _friction(where: str, joint: Any) -> tuple[float, float]:
     """Return viscous and Coulomb friction of the element <dynamics>; 0 where nothing is stated."""
     result = []
     for word in ("damping", "friction"):
-        value = None if one.dynamics is None else getattr(one.dynamics, word)
-        value = 0.0 if value is None or one.type == "fixed" else float(value)
+        value = None if joint.dynamics is None else getattr(joint.dynamics, word)
+        value = 0.0 if value is None or joint.type == "fixed" else float(value)
         if not (math.isfinite(value) and value >= 0.0):
             raise InputError(f"{where}: dynamics {word} = {value:g}; expected a number >= 0")
         result.append(value)
@@ -191,13 +192,13 @@ def _limit(where: str, word: str, limit: Any) -> float:
     return float(value)
 
 
-def _mimic(one: Any) -> Mimic:
-    multiplier = 1.0 if one.multiplier is None else float(one.multiplier)
-    return Mimic(one.joint, multiplier, 0.0 if one.offset is None else float(one.offset))
+def _mimic(mimic: Any) -> Mimic:
+    multiplier = 1.0 if mimic.multiplier is None else float(mimic.multiplier)
+    return Mimic(mimic.joint, multiplier, 0.0 if mimic.offset is None else float(mimic.offset))
 
 
 def _check_mimics(file: Path, joints: list[RobotJoint]) -> None:
-    leading = {one.name for one in joints if one.moves and one.mimic is None}
+    leading = {item.name for item in joints if item.moves and item.mimic is None}
     for joint in joints:
         if joint.mimic is not None and joint.mimic.joint not in leading:
             raise InputError(
@@ -245,15 +246,15 @@ def _pose(origin: Any) -> np.ndarray:
     return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
 
 
-def _link(file: Path, one: Any, package_path: Sequence[Path]) -> RobotLink:
-    shapes, missing = _shapes(file, one.name, one.collisions or one.visuals, package_path)
+def _link(file: Path, link: Any, package_path: Sequence[Path]) -> RobotLink:
+    shapes, missing = _shapes(file, link.name, link.collisions or link.visuals, package_path)
 
     def visual() -> tuple[Trimesh, ...]:
         with _quiet():
-            return _shapes(file, one.name, one.visuals, package_path)[0]
+            return _shapes(file, link.name, link.visuals, package_path)[0]
 
-    both = one.collisions and one.visuals
-    return RobotLink(one.name, _inertia(file, one), shapes, missing, visual if both else None)
+    both = link.collisions and link.visuals
+    return RobotLink(link.name, _inertia(file, link), shapes, missing, visual if both else None)
 
 
 def _shapes(
@@ -275,12 +276,12 @@ def _shapes(
 
 
 def _inertia(file: Path, link: Any) -> Inertia | None:
-    one = link.inertial
-    if one is None:
+    inertial = link.inertial
+    if inertial is None:
         return None
-    pose = _pose(one.origin)
-    tensor = np.zeros((3, 3)) if one.inertia is None else one.inertia
-    mass = 0.0 if one.mass is None else float(one.mass)
+    pose = _pose(inertial.origin)
+    tensor = np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia
+    mass = 0.0 if inertial.mass is None else float(inertial.mass)
     if not (np.isfinite(tensor).all() and math.isfinite(mass) and np.isfinite(pose).all()):
         raise InputError(f"{file}: link {link.name!r}: inertial holds a number that is not finite")
     R = pose[:3, :3]
@@ -290,8 +291,8 @@ def _inertia(file: Path, link: Any) -> Inertia | None:
 def _check_finite(where: str, numbers: Any, positive: bool = False) -> None:
     values = np.atleast_1d(np.asarray(numbers, dtype=float))
     if not np.isfinite(values).all() or (positive and (values <= 0.0).any()):
-        kind, found = "positive" if positive else "finite", ", ".join(f"{x:g}" for x in values.flat)
-        raise InputError(f"{where}: expected {kind} numbers, found {found}")
+        kind, given = "positive" if positive else "finite", ", ".join(f"{x:g}" for x in values.flat)
+        raise InputError(f"{where}: expected {kind} numbers, found {given}")
 
 
 def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -> Trimesh:
@@ -299,15 +300,15 @@ def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -
     from trimesh import creation
 
     for kind, names in SIZES.items():
-        if (one := getattr(geometry, kind)) is not None:
-            size = np.hstack([getattr(one, name) for name in names])
+        if (shape := getattr(geometry, kind)) is not None:
+            size = np.hstack([getattr(shape, name) for name in names])
             _check_finite(f"{file}: link {link!r}: size of a {kind}", size, positive=True)
-    if (one := geometry.box) is not None:
-        return creation.box(extents=one.size)
-    if (one := geometry.sphere) is not None:
-        return creation.icosphere(subdivisions=4, radius=one.radius)
-    if (one := geometry.cylinder) is not None:
-        return creation.cylinder(radius=one.radius, height=one.length, sections=SECTIONS)
+    if (shape := geometry.box) is not None:
+        return creation.box(extents=shape.size)
+    if (shape := geometry.sphere) is not None:
+        return creation.icosphere(subdivisions=4, radius=shape.radius)
+    if (shape := geometry.cylinder) is not None:
+        return creation.cylinder(radius=shape.radius, height=shape.length, sections=SECTIONS)
     return _mesh(file, geometry.mesh, package_path)
 
 
@@ -343,7 +344,7 @@ def _similar(file: Path, name: str) -> str:
 
 def sources_of(file: Path) -> list[Path]:
     """Return the files that a robot is read from: itself and its meshes, where they are found."""
-    meshes = [one.get("filename", "") for one in safe_xml(file).getroot().iter("mesh")]
+    meshes = [mesh.get("filename", "") for mesh in safe_xml(file).getroot().iter("mesh")]
     result = (mesh_path(file, name) for name in meshes)
     return [file, *(path for path in result if path is not None)]
 
@@ -359,10 +360,10 @@ def mesh_path(file: Path, name: str, package_path: Sequence[Path] = ()) -> Path 
     scheme, colon, rest = name.partition("://")
     if not colon or scheme == "file":
         path = Path(rest if colon else name)
-        places = [path] if path.is_absolute() else [one / path for one in _folders_above(file)]
+        places = [path] if path.is_absolute() else [above / path for above in _folders_above(file)]
     else:
         package, _, inner = rest.lstrip("/").partition("/")
-        places = [found / inner for found in _packages(file, package, package_path)]
+        places = [root / inner for root in _packages(file, package, package_path)]
         places += [folder / inner for folder in _folders_above(file)]
     return next((place for place in places if place.is_file()), None)
 
@@ -371,13 +372,13 @@ def _packages(file: Path, package: str, package_path: Sequence[Path]) -> Iterato
     """Yield the folders that may be a ROS package."""
 
     def stated(variable: str) -> list[Path]:
-        return [Path(one) for one in os.environ.get(variable, "").split(os.pathsep) if one]
+        return [Path(place) for place in os.environ.get(variable, "").split(os.pathsep) if place]
 
     for folder in (*package_path, *stated("ROS_PACKAGE_PATH")):
         if folder.absolute().name == package:
             yield folder
         yield folder / package
-        yield from sorted(one / package for one in folder.glob("*/"))  # a workspace of stacks
+        yield from sorted(place / package for place in folder.glob("*/"))  # a workspace of stacks
         yield folder / "share" / package
     for folder in stated("AMENT_PREFIX_PATH"):
         yield folder / "share" / package
@@ -489,7 +490,7 @@ def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
         tree = safe_xml(file)
     except (OSError, etree.XMLSyntaxError) as error:
         raise InputError(f"{file}: cannot be read ({error}); export needs the robot") from None
-    by_name = {one.get("name"): one for one in tree.getroot().iterfind("link")}
+    by_name = {element.get("name"): element for element in tree.getroot().iterfind("link")}
     for mesh in tree.getroot().iter("mesh"):
         name = mesh.get("filename", "")
         if "://" not in name and not os.path.isabs(name):
@@ -498,15 +499,15 @@ def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
     for link in links:
         if link.name not in by_name:
             raise InputError(f"{file}: no link {link.name!r}; is it the robot of the scene?")
-        one = by_name[link.name]
-        material = one.find("visual/material")
-        _replace(one, _inertial(link.inertia))
+        element = by_name[link.name]
+        material = element.find("visual/material")
+        _replace(element, _inertial(link.inertia))
         for kind in () if link.mesh is None else ("visual", "collision"):
             new = etree.Element(kind)
             etree.SubElement(etree.SubElement(new, "geometry"), "mesh", filename=link.mesh)
             if kind == "visual" and material is not None:
                 new.append(material)
-            _replace(one, new)
+            _replace(element, new)
     text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
     return text + b"\n"
 
@@ -517,8 +518,8 @@ def _replace(parent: Any, new: Any) -> None:
 
     old = parent.findall(new.tag)
     at = parent.index(old[0]) if old else len(parent)
-    for one in old:
-        parent.remove(one)
+    for element in old:
+        parent.remove(element)
     etree.indent(new, INDENT, level=2)
     new.tail = "\n" + 2 * INDENT
     if not (parent.text or "").strip():

@@ -100,7 +100,7 @@ class LinkCells:
 
     def offset(self, length: float) -> float:
         """Largest distance of an interface's middle from its joint, m."""
-        places = (self.points[one].reshape(-1, 3) for one in (self.inboard, self.outboard))
+        places = (self.points[facets].reshape(-1, 3) for facets in (self.inboard, self.outboard))
         middles = np.stack([0.5 * (at.min(axis=0) + at.max(axis=0)) for at in places])
         middles[1, 0] -= length
         return float(np.linalg.norm(middles, axis=1).max())
@@ -114,9 +114,9 @@ class _Grid:
     step: float
     shape: tuple[int, int, int]
 
-    def taken_from(self, other: _Grid, found: np.ndarray) -> np.ndarray:
+    def taken_from(self, other: _Grid, mask: np.ndarray) -> np.ndarray:
         """Return what is True at the middles of these voxels on another grid, False beyond it."""
-        around, at = np.pad(found, 1), []
+        around, at = np.pad(mask, 1), []
         for k, count in enumerate(self.shape):
             middle = self.low[k] + (np.arange(count) + 0.5) * self.step
             index = np.floor((middle - other.low[k]) / other.step).astype(int)
@@ -161,7 +161,7 @@ class _Pieces:
     @property
     def bounds(self) -> np.ndarray:
         """Lowest and highest corner (2, 3) of the box around them, m."""
-        every = np.array([one.bounds for one in (*self.closed, *self.open)])
+        every = np.array([piece.bounds for piece in (*self.closed, *self.open)])
         return np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
 
     @property
@@ -169,16 +169,18 @@ class _Pieces:
         """Mean thickness of what is between surfaces, 2 V / A, m: of a hollow link, of its wall."""
         if not self.closed:
             return np.inf
-        volume = sum(one.volume for one in self.closed) - sum(one.volume for one in self.hollows)
-        return float(2.0 * volume / sum(one.area for one in (*self.closed, *self.hollows)))
+        volume = sum(piece.volume for piece in self.closed) - sum(
+            piece.volume for piece in self.hollows
+        )
+        return float(2.0 * volume / sum(piece.area for piece in (*self.closed, *self.hollows)))
 
     def on(self, grid: _Grid) -> np.ndarray:
         """Return True for the voxels within the geometry."""
         result = np.zeros(grid.shape, dtype=bool)
-        for one in self.closed:
-            result |= grid.filled_by(one)
-        for one in self.hollows:
-            result &= ~grid.filled_by(one)
+        for piece in self.closed:
+            result |= grid.filled_by(piece)
+        for piece in self.hollows:
+            result &= ~grid.filled_by(piece)
         if self.open:
             result |= grid.taken_from(*self._within_open)
         return result
@@ -192,10 +194,10 @@ class _Pieces:
         margin = (radius + 1) * size / SHELL
         grid = _grid(low - margin, high + margin, size / SHELL)
         shell = np.zeros(grid.shape, dtype=bool)
-        for one in self.closed:
-            shell |= grid.filled_by(one)
-        for one in self.open:
-            shell |= grid.passed_by(one)
+        for piece in self.closed:
+            shell |= grid.filled_by(piece)
+        for piece in self.open:
+            shell |= grid.passed_by(piece)
         shell = ndimage.binary_dilation(shell, iterations=radius)
         shell = ndimage.binary_fill_holes(shell)
         shell = ndimage.binary_erosion(shell, iterations=radius)
@@ -287,8 +289,8 @@ def _pieces(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> _Pieces:
     hollows: list[Trimesh] = []
     left: list[Trimesh] = []
     filled = turned = dropped = 0
-    every = [_tidy(one, to_arm) for one in shapes]
-    size = max(float(np.ptp(np.vstack([one.bounds for one in every]), axis=0).max()), 1e-9)
+    every = [_tidy(piece, to_arm) for piece in shapes]
+    size = max(float(np.ptp(np.vstack([piece.bounds for piece in every]), axis=0).max()), 1e-9)
     for shape in every:
         if shape.is_volume and shape.body_count == 1:
             closed.append(shape)
@@ -298,21 +300,21 @@ def _pieces(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> _Pieces:
             continue
         own = list(shape.split(only_watertight=False, repair=False))
         is_solid = shape.is_volume  # its pieces turned inwards are hollows
-        for one in own:
-            if np.ptp(one.bounds, axis=0).max() < TINY * size:
+        for piece in own:
+            if np.ptp(piece.bounds, axis=0).max() < TINY * size:
                 dropped += 1
-            elif one.is_watertight:
-                if is_solid and one.volume < 0.0 and _lies_in_another(one, own):
-                    one.invert()
-                    hollows.append(one)
+            elif piece.is_watertight:
+                if is_solid and piece.volume < 0.0 and _lies_in_another(piece, own):
+                    piece.invert()
+                    hollows.append(piece)
                 else:
-                    turned += int(_turn_outwards(one))
-                    closed.append(one)
-            elif (whole := _with_holes_closed(one)) is not None:
+                    turned += int(_turn_outwards(piece))
+                    closed.append(piece)
+            elif (mended := _with_holes_closed(piece)) is not None:
                 filled += 1
-                closed.append(whole)
+                closed.append(mended)
             else:
-                left.append(one)
+                left.append(piece)
     if not closed and not left:
         raise NoSolid("its geometry has no extent")
     many = len(closed) + len(left)
@@ -343,13 +345,13 @@ def _tidy(shape: Trimesh, to_arm: np.ndarray) -> Trimesh:
     return result
 
 
-def _lies_in_another(one: Trimesh, pieces: Sequence[Trimesh]) -> bool:
+def _lies_in_another(piece: Trimesh, pieces: Sequence[Trimesh]) -> bool:
     return any(
         other.volume > 0.0
-        and (other.bounds[0] <= one.bounds[0]).all()
-        and (one.bounds[1] <= other.bounds[1]).all()
+        and (other.bounds[0] <= piece.bounds[0]).all()
+        and (piece.bounds[1] <= other.bounds[1]).all()
         for other in pieces
-        if other is not one
+        if other is not piece
     )
 
 
@@ -372,12 +374,12 @@ def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
 
     wide = 10.0 * float(np.ptp(piece.bounds, axis=0).max())
     surface = pyvista.PolyData.from_regular_faces(piece.vertices, piece.faces)
-    found = surface.fill_holes(wide).triangulate()
-    whole = trimesh.Trimesh(found.points, found.regular_faces, process=True)
-    if not whole.is_watertight or len(whole.faces) < 4:
+    filled = surface.fill_holes(wide).triangulate()
+    closed = trimesh.Trimesh(filled.points, filled.regular_faces, process=True)
+    if not closed.is_watertight or len(closed.faces) < 4:
         return None
-    _turn_outwards(whole)
-    return whole
+    _turn_outwards(closed)
+    return closed
 
 
 # -- where it is cut -------------------------------------------------------------------------
@@ -407,9 +409,9 @@ def _region(
     return largest, float(largest.sum() / result.sum())
 
 
-def _connected(found: np.ndarray) -> np.ndarray:
+def _connected(mask: np.ndarray) -> np.ndarray:
     """Return the largest connected part of what is True."""
-    labels, _ = ndimage.label(found)
+    labels, _ = ndimage.label(mask)
     return np.asarray(labels == 1 + int(np.bincount(labels.ravel())[1:].argmax()))
 
 
@@ -471,16 +473,16 @@ def _largest(pieces: _Pieces) -> _Piece:
     return result
 
 
-def _between(pieces: _Pieces, whole: _Piece, ends: tuple[float, float]) -> _Piece | None:
+def _between(pieces: _Pieces, link: _Piece, ends: tuple[float, float]) -> _Piece | None:
     """Return the piece that leads from one end to the other; None without one."""
-    box = whole.box.copy()
+    box = link.box.copy()
     box[:, 0] = ends
     along = ends[1] - ends[0]
-    grid = _grid(box[0], box[1], along / max(8, round(along / whole.grid.step)))
+    grid = _grid(box[0], box[1], along / max(8, round(along / link.grid.step)))
     region, share = _region(pieces, grid, ends)
     if share < WHOLE or not (region[2].any() and region[-3].any()):
         return None
-    return _piece(region, share * whole.share, grid, box)
+    return _piece(region, share * link.share, grid, box)
 
 
 def _shortened(ends: tuple[float, float], length: float) -> list[str]:
@@ -543,9 +545,9 @@ def _facets(solid: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarra
     around = np.pad(solid, 1)
     result, axes = [], []
     for (axis, way), side in SIDES.items():
-        beside = where + 1
-        beside[:, axis] += way
-        outer = ~around[tuple(beside.T)]
+        neighbour = where + 1
+        neighbour[:, axis] += way
+        outer = ~around[tuple(neighbour.T)]
         result.append(cells[outer][:, side])
         axes.append(np.full(outer.sum(), axis))
     return np.concatenate(result), np.concatenate(axes)
@@ -616,5 +618,5 @@ def _on_surface(
 
 def _jacobians(corners: np.ndarray) -> np.ndarray:
     """Return the Jacobian (n, 8) at the corners of hexahedra (n, 8, 3), m3."""
-    a, b, c = (corners[:, list(one)] - corners for one in zip(*AROUND, strict=True))
+    a, b, c = (corners[:, list(corner)] - corners for corner in zip(*AROUND, strict=True))
     return np.asarray(np.einsum("nka,nka->nk", a, np.cross(b, c)))

@@ -147,8 +147,8 @@ class RobotLink:
         result = 0.0
         for shape in self.shapes:
             try:
-                whole = shape if shape.is_watertight else shape.convex_hull
-                result += abs(float(whole.volume))
+                closed = shape if shape.is_watertight else shape.convex_hull
+                result += abs(float(closed.volume))
             except QhullError:  # a flat one
                 continue
         return result
@@ -561,27 +561,27 @@ class _Reader:
     places: Mapping[str, tuple[str, np.ndarray]]
     bodies: Mapping[str, SceneBody]
 
-    def closure(self, key: str, one: Any) -> tuple[dict[str, Any], tuple[str, np.ndarray] | None]:
+    def closure(self, key: str, table: Any) -> tuple[dict[str, Any], tuple[str, np.ndarray] | None]:
         """Return a closure's keys, and the interface (link of the body, point) that it needs."""
-        if not isinstance(one, dict):
-            raise _refused(self.file, key, one, "expected a table [[closures]]")
+        if not isinstance(table, dict):
+            raise _refused(self.file, key, table, "expected a table [[closures]]")
         for name in ("name", "kind"):
-            if not isinstance(one.get(name), str):
-                raise _refused(self.file, f"{key}.{name}", one.get(name), "expected a word")
-        links: Any = one.get("links")
-        points: Any = one.get("points")
+            if not isinstance(table.get(name), str):
+                raise _refused(self.file, f"{key}.{name}", table.get(name), "expected a word")
+        links: Any = table.get("links")
+        points: Any = table.get("points")
         if not _is_list(links, 2, str) or links[0] == GROUND:
             expected = 'expected a link, then another or "ground"'
             raise _refused(self.file, f"{key}.links", links, expected)
         if not (_is_list(points, 2, list) and all(_is_list(p, 3, int | float) for p in points)):
             expected = "expected two points, in the links' frames [m]"
             raise _refused(self.file, f"{key}.points", points, expected)
-        keys = {name: value for name, value in one.items() if name not in OWN}
+        keys = {name: value for name, value in table.items() if name not in OWN}
         ends = zip(links, points, strict=True)
         (body, first), (other, second) = (self._place(f"{key}.links", *end) for end in ends)
         if body == GROUND:
             raise _refused(self.file, f"{key}.links", links, "expected a link that moves first")
-        if one["kind"] not in ("ball", "rod") and not np.allclose(first[:3, :3], np.eye(3)):
+        if table["kind"] not in ("ball", "rod") and not np.allclose(first[:3, :3], np.eye(3)):
             raise _refused(
                 self.file,
                 f"{key}.links",
@@ -589,11 +589,11 @@ class _Reader:
                 f"{links[0]} is turned against {body}, to which it is fixed: name {body}",
             )
         keys["point"] = second[:3, 3].tolist()
-        if one["kind"] != "rod":
-            keys["rpy"] = self._turned(key, one.get("rpy", [0.0] * 3), second[:3, :3])
+        if table["kind"] != "rod":
+            keys["rpy"] = self._turned(key, table.get("rpy", [0.0] * 3), second[:3, :3])
         keys["between"], interface = [body, other], None
         if not self.bodies[body].is_solid and np.linalg.norm(first[:3, 3]) > SAME_PLACE:
-            keys["between"][0], interface = f"{body}.{one['name']}", (body, first[:3, 3])
+            keys["between"][0], interface = f"{body}.{table['name']}", (body, first[:3, 3])
         return keys, interface
 
     def _turned(self, key: str, rpy: Any, R: np.ndarray) -> list[float]:

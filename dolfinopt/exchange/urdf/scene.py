@@ -129,11 +129,11 @@ class RobotScene:
 
     def _solid(self, body: SceneBody) -> list[str]:
         own, file = body.inertia, _one_line(self.robot.file.name)
-        one = _extent(body)
+        extent = _extent(body)
         if body.mesh is None:
             guess = "a guess: its geometry does not tell"
             by = f"{'the extents of its geometry' if body.measured else guess}: edit them"
-            keys = [f"cells = {list(cells_of(body.length, *one.sides))}"]
+            keys = [f"cells = {list(cells_of(body.length, *extent.sides))}"]
         else:
             by = "those of its geometry"
             keys = [
@@ -142,7 +142,7 @@ class RobotScene:
             ]
             if body.mesh.done:
                 keys.insert(0, f"# {'; '.join(body.mesh.done)}")
-            if body.mesh.offset > CENTRED * max(one.sides):
+            if body.mesh.offset > CENTRED * max(extent.sides):
                 keys.append(
                     f"interface_offset = {number(_up(1.001 * body.mesh.offset))}  # m, of their "
                     "middles from the joints"
@@ -151,12 +151,12 @@ class RobotScene:
             "[[arms]]",
             f"name = {_string(self.arms[body.link])}",
             f"length = {number(body.length)}  # m, from joint to joint",
-            f"height = {number(one.sides[0])}  # m, {by}",
-            f"thickness = {number(one.sides[1])}",
+            f"height = {number(extent.sides[0])}  # m, {by}",
+            f"thickness = {number(extent.sides[1])}",
             *keys,
-            f"passive = {number(one.passive)}  # m, kept solid at the joints: one layer of cells, "
-            f"{DENSITY * one.ends:.3g} kg",
-            f"# all solid it weighs {DENSITY * one.volume:.4g} kg; {file}: "
+            f"passive = {number(extent.passive)}  # m, kept solid at the joints: one layer of "
+            f"cells, {DENSITY * extent.ends:.3g} kg",
+            f"# all solid it weighs {DENSITY * extent.volume:.4g} kg; {file}: "
             f"{own.mass:.4g} kg, centre {_rounded(own.centre)}",
         ]
 
@@ -168,19 +168,19 @@ class RobotScene:
         density is at least `LEAST` and at most 1.
         """
         solids = [_extent(body) for body in self.bodies if body.is_solid]
-        whole = sum(solid.volume for solid in solids)
+        volume = sum(solid.volume for solid in solids)
         ends = sum(solid.blurred for solid in solids)
         mass = sum(body.inertia.mass for body in self.bodies if body.is_solid)
-        wanted = mass / (DENSITY * whole) if mass > 0.0 else FRACTION
-        initial = min(1.0, max(LEAST, (wanted * whole - ends) / (whole - ends)))
+        wanted = mass / (DENSITY * volume) if mass > 0.0 else FRACTION
+        initial = min(1.0, max(LEAST, (wanted * volume - ends) / (volume - ends)))
         initial = float(f"{initial:.4g}")
-        return float(f"{(ends + initial * (whole - ends)) / whole:.4g}"), initial
+        return float(f"{(ends + initial * (volume - ends)) / volume:.4g}"), initial
 
     def masses(self, body: SceneBody) -> str:
         """Return what a solid weighs at the start, in the file, and all solid."""
-        one, initial = _extent(body), self.start[1]
-        start = DENSITY * (one.blurred + initial * (one.volume - one.blurred))
-        said = f"starts at {start:.3g} kg of {DENSITY * one.volume:.3g} kg all solid"
+        extent, initial = _extent(body), self.start[1]
+        start = DENSITY * (extent.blurred + initial * (extent.volume - extent.blurred))
+        said = f"starts at {start:.3g} kg of {DENSITY * extent.volume:.3g} kg all solid"
         return f"{said}, the file says {body.inertia.mass:.3g} kg"
 
     def mesh_name(self, body: SceneBody) -> str:
@@ -209,13 +209,13 @@ class RobotScene:
             lines.append(f"point = {_list(_tidy(point))}")
         return lines
 
-    def _closure(self, one: Mapping[str, Any]) -> list[str]:
+    def _closure(self, closure: Mapping[str, Any]) -> list[str]:
         """Return a closure with arms in place of links."""
         ends = []
-        for end in one["between"]:
+        for end in closure["between"]:
             link = max((k for k in (*self.arms, GROUND) if f"{end}.".startswith(f"{k}.")), key=len)
             ends.append((GROUND if link == GROUND else self.arms[link]) + end[len(link) :])
-        values = {**one, "between": ends}
+        values = {**closure, "between": ends}
         return ["[[closures]]", *(f"{key} = {toml_value(value)}" for key, value in values.items())]
 
     def _joint(self, body: SceneBody) -> list[str]:

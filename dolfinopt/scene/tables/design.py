@@ -263,8 +263,8 @@ class Design(Table):
         shares = {i: scene.arms[like.get(i, i)].fixed_shares for i in flexible}
         if self.shared_volume:
             volumes = {i: a.length * a.height * a.thickness for i, a in flexible.items()}
-            whole = sum(volumes.values())
-            solid, void = (sum(shares[i][k] * volumes[i] for i in shares) / whole for k in (0, 1))
+            volume = sum(volumes.values())
+            solid, void = (sum(shares[i][k] * volumes[i] for i in shares) / volume for k in (0, 1))
             shares = dict.fromkeys(shares, (solid, void))
         for i, (share, void) in shares.items():
             if share + (1.0 - share - void) * self.minimum > limit:

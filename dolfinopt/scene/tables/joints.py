@@ -12,6 +12,8 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from dolfinopt.scene.tables.base import Length, Position, Refusal, Table, Use, setting, shown
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from dolfinopt.scene.schema import Scene
     from dolfinopt.scene.tables.arms import Arm
     from dolfinopt.scene.tables.machine import Joint
@@ -122,15 +124,15 @@ def check_interfaces(scene: Scene, index: int) -> None:
         if interface.axis is not None and (arm.mesh is None or not arm.flexible):
             raise Refusal("expected only with a mesh file, whose bore it is", f"{here}.axis")
         if (interface.radius is None) == (celled or interface.axis is not None):
-            made = "a rigid arm" if arm.rigid else "an arm made of cells"
+            owner = "a rigid arm" if arm.rigid else "an arm made of cells"
             if arm.sid is not None:
-                made = f'a body from a file, which has a node "{interface.name}"'
+                owner = f'a body from a file, which has a node "{interface.name}"'
             elif not arm.rigid and arm.cells is None:
-                made = f'a mesh file, which has faces in a group "{interface.name}"'
+                owner = f'a mesh file, which has faces in a group "{interface.name}"'
             if interface.axis is not None:
-                made = "the axis of a bore"
+                owner = "the axis of a bore"
             expected = "a number > 0 [m]" if interface.radius is None else "none"
-            raise Refusal(f"expected {expected} with {made}", f"{here}.radius")
+            raise Refusal(f"expected {expected} with {owner}", f"{here}.radius")
 
 
 def check_used(scene: Scene) -> None:
@@ -190,8 +192,10 @@ def check_bores(arm: Arm) -> None:
             )
 
 
-def frame_of(arm: Arm) -> tuple[Vector, tuple[Vector, Vector, Vector]] | None:
-    """Return origin and axes x, y, z of the arm's frame in its mesh file's; None: they are one.
+def frame_of(arm: Arm) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return origin (3,), m, and axes x, y, z (rows) of the arm's frame in its mesh file's.
+
+    None where they are one.
 
     The origin is the inboard bore's point, x leads to the outboard one's, and z is the inboard
     bore's axis, as far as it is normal to x. Where it is along x, z is that of the file's axes
@@ -200,15 +204,16 @@ def frame_of(arm: Arm) -> tuple[Vector, tuple[Vector, Vector, Vector]] | None:
     inboard, outboard = arm.end_bore(INBOARD), arm.end_bore(OUTBOARD)
     if inboard is None or outboard is None or inboard.axis is None:
         return None
-    o = inboard.point
-    x = _unit(tuple(b - a for a, b in zip(o, outboard.point)))
-    z = _unit(inboard.axis)
-    if math.hypot(*_cross(x, z)) < ALONG:
-        best = min((2, 1, 0), key=lambda k: abs(x[k]))
-        z = (float(best == 0), float(best == 1), float(best == 2))
-    along = _dot(x, z)
-    z = _unit(tuple(b - along * a for a, b in zip(x, z)))
-    return o, (x, _cross(z, x), z)
+    import numpy as np  # which scenes without bores do not need
+
+    origin = np.array(inboard.point)
+    x, z = np.array(outboard.point) - origin, np.array(inboard.axis)
+    x /= np.linalg.norm(x)
+    if np.linalg.norm(np.cross(x, z)) < ALONG * np.linalg.norm(z):
+        z = np.eye(3)[2 - np.argmin(np.abs(x[::-1]))]
+    z = z - (x @ z) * x
+    z /= np.linalg.norm(z)
+    return origin, np.array([x, np.cross(z, x), z])
 
 
 def in_frame(arm: Arm, point: Point) -> Point:
@@ -216,21 +221,7 @@ def in_frame(arm: Arm, point: Point) -> Point:
     if (frame := frame_of(arm)) is None:
         return point
     origin, axes = frame
-    apart = tuple(b - a for a, b in zip(origin, point))
-    x, y, z = (_dot(axis, apart) for axis in axes)
-    return x, y, z
-
-
-def _dot(a: tuple[float, ...], b: tuple[float, ...]) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True))
-
-
-def _cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def _unit(a: tuple[float, ...]) -> Vector:
-    x, y, z = (value / math.hypot(*a) for value in a)
+    x, y, z = (axes @ (point - origin)).tolist()
     return x, y, z
 
 

@@ -346,13 +346,11 @@ class ConstraintOptions(Table):
 
     def _check_arms(self, scene: Scene) -> None:
         """Refuse responses of flexible arms where there are none."""
-        for one in asked(scene) if not scene.cell_counts else ():
-            if one.of_arms:
-                where = f".{one.key}" if one.key in self.limits else "objective.kind"
+        for response in asked(scene):
+            where = f".{response.key}" if response.key in self.limits else "objective.kind"
+            if response.of_arms and not scene.cell_counts:
                 raise Refusal("expected another response: no arm is flexible", where)
-        for one in (response for response in asked(scene) if response.name == "stress"):
-            for name, kind in scene.without_strength.items():
-                where = f".{one.key}" if one.key in self.limits else "objective.kind"
+            for name, kind in scene.without_strength.items() if response.name == "stress" else ():
                 raise Refusal(
                     f"expected another response: {name} is {kind}, and no strength criterion is "
                     "known for that; limit deviation or buckling",
@@ -414,8 +412,8 @@ class Constraints(ConstraintOptions):
         """Take None for inf, which JSON does not know."""
         if not isinstance(value, list | tuple):
             return value
-        free = tuple(None if one == math.inf else one for one in value)
-        if free and all(one is None for one in free):
+        free = tuple(None if limit == math.inf else limit for limit in value)
+        if free and all(limit is None for limit in free):
             raise Refusal("expected a limit for one drive at least")
         return free
 
@@ -427,26 +425,26 @@ class Constraints(ConstraintOptions):
         return cases
 
 
-def _add_key(one: Declaration) -> None:
+def _add_key(response: Declaration) -> None:
     """Add the key that limits a response to `Constraints`, which is to be rebuilt."""
-    if one.limit and one.limit.stated:
+    if response.limit and response.limit.stated:
         field = FieldInfo(
-            default=None, description=one.limit.help, annotation=one.limit.type | None
+            default=None, description=response.limit.help, annotation=response.limit.type | None
         )
-        Constraints.model_fields[one.key] = field
+        Constraints.model_fields[response.key] = field
 
 
-for _one in DECLARED.values():
-    _add_key(_one)
+for _response in DECLARED.values():
+    _add_key(_response)
 
 
-def declare(one: Declaration) -> None:
+def declare(response: Declaration) -> None:
     """Let scenes that are read from now on name a response."""
     from dolfinopt.scene.schema import Scene
 
-    DECLARED[one.name] = one
+    DECLARED[response.name] = response
     Objective.model_fields["kind"].annotation = Literal[tuple(objective_kinds())]  # type: ignore
-    _add_key(one)
+    _add_key(response)
     for table in (Objective, Constraints, Scene):
         table.model_rebuild(force=True)
 
@@ -489,7 +487,7 @@ class Scenario(Table):
         """Refuse changes of a material that are more than a factor of its stiffness."""
         for change in self.changes:
             table, _, key = change.partition("=")[0].strip().partition(".")
-            allowed = [one for one in scene.scaling_keys if one != "thickness"]
+            allowed = [name for name in scene.scaling_keys if name != "thickness"]
             if table == "material" and key not in (*allowed, "yield_strength"):
                 raise Refusal(
                     f"expected of the material {' or '.join(allowed)} alone: the reduced basis "
