@@ -328,7 +328,7 @@ def _keys(scene: Scene) -> str:
     keys = {
         "arc": "motion.radius, motion.flattening",
         "line": "motion.start, motion.end",
-        "rotation": "motion.start_angle",
+        "rotation": "motion.initial_joints",
     }.get(motion.path, "the table motion.file")
     if follows(scene):
         return keys
@@ -358,10 +358,11 @@ def follower(scene: Scene) -> Follower:
         has_path=first.place[0].shape[1] > 0,
         turned=first.turning is not None,
     )
-    stated, side = scene.motion.initial_joints, 0
+    stated, side = scene.motion.initial_joints or (), 0
     guess, joints = np.zeros(len(units)), 0 if scene.is_spatial else 1
-    if stated is not None:
-        guess[joints : joints + len(stated)] = stated
+    chosen = joints + len(stated) == len(units)  # else of a rotation its own joint's alone
+    if chosen:
+        guess[joints:] = stated
     elif scene.closures and not scene.is_spatial:
         side = scene.motion.elbow
     return Follower(
@@ -372,7 +373,7 @@ def follower(scene: Scene) -> Follower:
             passive=np.array(passive_coordinates(scene), dtype=int),
             target=lambda t: target_of(t, scene),
             guess=guess,
-            width=1.5 if stated is None else 0.1,
+            width=0.1 if chosen else 1.5,
             side=side,
             end=_end(scene),
             resolution=max(DENSE_INSTANTS, 2 * len(table_rows(scene))),

@@ -120,6 +120,10 @@ def _first_mode(tree: Tree, row: Row, key: str, value: Any) -> Any:
     return "first" if value is True else value or None
 
 
+def _first_joint(tree: Tree, row: Row, key: str, value: Any) -> list[Any]:
+    return [value, *(row.get(key) or [])[1:]]
+
+
 def _exact(tree: Tree, row: Row, key: str, value: Any) -> str | None:
     return "exact" if value else None
 
@@ -159,6 +163,8 @@ OLD_WORDS = (
     OldWord("closures.side", "motion.elbow", _way),
     OldWord("motion.base_position", "motion.base", _only_with("base", "fixed"),
             "motion.base = the number", 0.0),
+    OldWord("motion.start_angle", "motion.initial_joints", _first_joint,
+            "motion.initial_joints = [it]", 0.0),
     OldWord("constraints.path_speed", "motion.max_speed"),
     OldWord("constraints.path_acceleration", "motion.max_acceleration"),
     OldWord("constraints.path_jerk", "motion.max_jerk"),
@@ -214,8 +220,10 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
             if word.new and value is not None:
                 if not anew and not unset:
                     _refuse_both(row, word, source)
-                # Of what an arm states the default counts, too: the arm before may have another.
-                stated = table == "arms" and word.new.rpartition(".")[2] not in row
+                # A stated default counts where else another value would: the arm before's, or
+                # that of a guess.
+                known = word.new.rpartition(".")[2] in row
+                stated = not known if table == "arms" else known and word.value is _first_joint
                 if anew or not unset or stated:
                     word.put(tree, row, value)
             if not unset or (anew and word.new):

@@ -221,7 +221,7 @@ def test_run_up_of_a_crank():
 def test_loops_of_the_plane(kind, side):
     """The end stays on its line, or at its pin; `side` is the sign of the last joint's angle."""
     line = {"point": [0.3, 0.05], "direction": [1.0, 0.2]} if kind == "slider" else {}
-    tree = loop_tree(kind, closure={"side": side} | line, motion={"start_angle": 0.4})
+    tree = loop_tree(kind, closure={"side": side} | line, motion={"initial_joints": [0.4]})
     scene = scene_from_dict(tree)
     t = np.linspace(0.0, scene.motion.horizon, 101)
     motion = rigid_motion(t, scene)
@@ -248,7 +248,7 @@ def test_initial_joints_choose_a_branch_of_the_plane():
         start = loop_start(scene_from_dict(tree))
         assert list(start) == ["coupler", "rocker"]
         starts.append(start)
-    near = [0.0 + tree["motion"].get("start_angle", 0.0), *(x + 0.05 for x in starts[0].values())]
+    near = [0.0, *(x + 0.05 for x in starts[0].values())]
     chosen = loop_start(scene_from_dict(with_keys(tree, {"motion": {"initial_joints": near}})))
     assert list(chosen.values()) == pytest.approx(list(starts[0].values()), abs=1e-12)
 

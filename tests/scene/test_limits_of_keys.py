@@ -57,7 +57,7 @@ MACHINE_KEYS = (
     "arms.gear",
     "motion.speed",
 )
-MACHINE_KEYS += ("motion.start_angle", "motion.cart_mass")
+MACHINE_KEYS += ("motion.cart_mass",)
 
 
 def limits(keys=()):

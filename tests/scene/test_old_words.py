@@ -3,7 +3,7 @@
 import pytest
 from runs import TWO_ARM
 
-from dolfinopt.scene.load import read_scene
+from dolfinopt.scene.load import read_scene, scene_from_dict
 from dolfinopt.scene.messages import implausible
 
 pytestmark = pytest.mark.serial
@@ -11,12 +11,14 @@ pytestmark = pytest.mark.serial
 FIXED = ("motion.base=fixed", "motion.radius=0.6")
 VIBRATES = ("objective.kind=eigenfrequency",)
 SHAPED = ("motion.shape=2", "objective.gradient=exact")
+TURNS = (*FIXED[:1], "motion.path=rotation", "arms.1.length=0.5", "closure.kind=slider")
 ROBUST = ("design.projection=robust",)
 
 
 @pytest.mark.parametrize(
     ("used", "old", "new"),
     [
+        (TURNS, "motion.start_angle=0.1", "motion.initial_joints=[0.1]"),
         (FIXED, "motion.base_position=0.1", "motion.base=0.1"),
         (VIBRATES, "objective.follow=true", "objective.modes=first"),
         (SHAPED, "constraints.path_speed=9", "motion.max_speed=9"),
@@ -37,3 +39,9 @@ def test_a_scene_in_older_words_is_that_in_those_of_now(used, old, new):
     if not old.endswith("nominal"):
         table, *_, key = old.partition("=")[0].split(".")
         assert [f"{table}.{key} is read as" in line for line in implausible(older)] == [True]
+
+
+def test_a_start_of_zero_counts_beside_a_guess():
+    tree = read_scene(TWO_ARM, [*TURNS, "motion.initial_joints=[0.1, 2.0]"]).to_dict()
+    tree["motion"]["start_angle"] = 0.0
+    assert scene_from_dict(tree).motion.initial_joints == (0.0, 2.0)

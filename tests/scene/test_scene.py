@@ -219,7 +219,6 @@ BAD_VALUES = [
     ("constraints.settling_after", [1.2], "at most 1.1 [s], from motion.duration = 1.9"),
     ("motion.horizon", [1.0], "at least motion.duration = 1.9 [s]"),
     ("motion.acceleration_share", [0.3], '0.25, the default, with law = "quintic"'),
-    ("motion.start_angle", [1.0], "0.0, the default"),
     ("motion.gravity", [[0, 0, -9.81]], "two numbers without [[joints]]"),
     ("payload.inertia", [[1, 1]], "an array of six numbers"),
     ("payload.arm", ["arm1"], "none without [[joints]]"),

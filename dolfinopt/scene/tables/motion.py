@@ -55,7 +55,7 @@ class Motion(Table):
         Use("start end rpy", "path", "line"),
         Use("initial_joints", "path", "line points joints rotation"),
         Use("file table_ends", "path", "points joints"),
-        Use("speed start_angle", "path", "rotation"),
+        Use("speed", "path", "rotation"),
         Use("cart_follow max_speed max_acceleration max_jerk", "path", "arc line points"),
         Use("cart_follow cart_mass", "base", "cart"),
         Use("acceleration_share", "law", "trapezoidal s-curve"),
@@ -85,7 +85,8 @@ class Motion(Table):
         None,
         "joint coordinates near those at the start of an end-effector's path in "
         "space, or of closed loops, for [[joints]] that move, in the plane for all arms: which "
-        "solution is meant; default: 0, in the plane by elbow [rad, m]",
+        "solution is meant; of a rotation the first one is its joint's at the start, and the "
+        "others may be left out; default: 0, in the plane by elbow [rad, m]",
     )
     file: FileName | None = setting(
         None,
@@ -98,9 +99,6 @@ class Motion(Table):
         "gives it; path rotation [rad/s]",
         ge=-1e6,
         le=1e6,
-    )
-    start_angle: float = setting(
-        0.0, "angle of the first joint at the start [rad]", ge=-1e3, le=1e3
     )
     law: TimeLaw = setting(
         "quintic",
@@ -216,6 +214,11 @@ class Motion(Table):
         return self.base if isinstance(self.base, float) else 0.0
 
     @property
+    def start_angle(self) -> float:
+        """Angle of the first joint at the start of a rotation, rad."""
+        return self.initial_joints[0] if self.initial_joints else 0.0
+
+    @property
     def coefficients(self) -> tuple[float, ...]:
         """The coefficients of a shaped law, shares of the way; 0 where none are stated."""
         return self.shape if isinstance(self.shape, tuple) else (0.0,) * self.shape
@@ -278,13 +281,16 @@ class Motion(Table):
         self._check_limits()
         if scene.is_spatial:
             return  # `tables.joints` knows
+        turns = self.path == "rotation"
         if not scene.closures:
-            if self.path in ("joints", "rotation"):
+            if turns or self.path == "joints":
                 reason = f"with path = {shown(self.path)}: no path is followed, and no loop closed"
                 self.refuse_stated(".elbow", reason, ".path")
-            reason = "without [[joints]]: elbow says which solution is meant"
-            self.refuse_stated(".initial_joints", reason)
-        refuse_count(self.initial_joints, [arm.name for arm in scene.arms], ".initial_joints")
+            if not turns:
+                reason = "without [[joints]]: elbow says which solution is meant"
+                self.refuse_stated(".initial_joints", reason)
+        if not (turns and len(self.initial_joints or ()) == 1):
+            refuse_count(self.initial_joints, [arm.name for arm in scene.arms], ".initial_joints")
         independent = len(scene.arms) - scene.dependent_joints
         if self.path == "rotation" and independent > 1:
             raise Refusal(
