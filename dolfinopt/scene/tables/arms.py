@@ -14,11 +14,15 @@ from pydantic.fields import FieldInfo
 from dolfinopt.scene.tables.base import (
     NAMES_FILE,
     FileName,
+    Inertia,
     Length,
     Loc,
     Position,
     Refusal,
+    Six,
     Table,
+    Three,
+    TwoOrThree,
     Use,
     setting,
     shown,
@@ -61,9 +65,8 @@ if TYPE_CHECKING:
 
 # -- inertia of rigid bodies in space, as URDF states it -----------------------------------------
 
-Moment = Annotated[float, Field(ge=0, le=1e9)]  # kg m2
 Product = Annotated[float, Field(ge=-1e9, le=1e9)]
-Tensor = tuple[Product, Product, Product, Product, Product, Product]  # xx, yy, zz, xy, xz, yz
+Tensor = Six[Product]  # xx, yy, zz, xy, xz, yz
 # By how much, over the largest, rounded moments may miss the triangle inequality.
 ROUNDED = 1e-6
 
@@ -170,7 +173,7 @@ class Arm(Table):
     )
     height: Length = setting("height in the plane of motion [m]")
     thickness: Length = setting("thickness normal to the plane of motion [m]")
-    cells: tuple[CellCount, CellCount] | tuple[CellCount, CellCount, CellCount] | None = setting(
+    cells: TwoOrThree[CellCount] | None = setting(
         (200, 12),
         "number of cells along and across a rectangular arm in plane stress; along, "
         "over the height and over the thickness of a solid one [-]",
@@ -258,12 +261,12 @@ class Arm(Table):
         ge=0,
         le=1e9,
     )
-    inertia: Moment | Tensor | None = setting(
+    inertia: Inertia | Tensor | None = setting(
         None,
         "moment of inertia of a rigid arm about its centre, in space the tensor xx, "
         "yy, zz, xy, xz, yz; default: that of a bar of its mass [kg m2]",
     )
-    centre: tuple[Position, Position, Position] | None = setting(
+    centre: Three[Position] | None = setting(
         None, "centre of mass of a rigid arm in space, in the arm's frame; default: halfway [m]"
     )
     joint_mass: float = setting(

@@ -13,6 +13,7 @@ from typing import (
     ClassVar,
     Literal,
     NamedTuple,
+    TypeVar,
     Union,
     get_args,
     get_origin,
@@ -38,9 +39,20 @@ if TYPE_CHECKING:
 # Ranges far beyond what machines need, within which products and quotients of all quantities stay
 # within double precision. What is merely improbable is for `plausibility.py` to say.
 Length = Annotated[float, Field(ge=1e-6, le=1e4)]  # m
-Position = Annotated[float, Field(ge=-1e4, le=1e4)]  # m
+Position = Annotated[float, Field(ge=-1e4, le=1e4)]  # m; rad, m of a joint's coordinate
+Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 Duration = Annotated[float, Field(ge=1e-4, le=1e5)]  # s
+Instant = Annotated[float, Field(ge=0, le=1e5)]  # s
 Frequency = Annotated[float, Field(ge=0, le=1e9)]  # Hz
+Inertia = Annotated[float, Field(ge=0, le=1e9)]  # kg m2; kg
+Stiffness = Annotated[float, Field(ge=0, le=1e15)]  # N/m, N m/rad; of dampers and gains, too
+DriveForce = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m; rates alike
+Component = Annotated[float, Field(ge=-1e6, le=1e6)]  # of a direction
+
+T = TypeVar("T")
+Three = tuple[T, T, T]
+Six = tuple[T, T, T, T, T, T]
+TwoOrThree = tuple[T, T] | tuple[T, T, T]  # in the plane or in space
 MAX_ITERATIONS = 1_000_000
 
 NAMES_FILE = "names a file"

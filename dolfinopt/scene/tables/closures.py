@@ -9,11 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, field_validator, model_validator
 
 from dolfinopt.scene.tables.base import (
+    Angle,
+    Component,
     Length,
     Loc,
     Position,
     Refusal,
+    Stiffness,
     Table,
+    Three,
+    TwoOrThree,
     Use,
     input_error,
     setting,
@@ -25,14 +30,7 @@ from dolfinopt.scene.tables.joints import (
     place_of,
     site_of,
 )
-from dolfinopt.scene.tables.machine import (
-    GROUND,
-    Angle,
-    Component,
-    Direction,
-    Gain,
-    check_joint_name,
-)
+from dolfinopt.scene.tables.machine import GROUND, Direction, check_joint_name
 from dolfinopt.scene.tables.responses import asked, need_of
 
 if TYPE_CHECKING:
@@ -78,15 +76,15 @@ class Closures(Table):
     between: tuple[str, str] = setting(
         'what it joins: "arm.interface" or "arm" for its outboard one, then another or "ground" [-]'
     )
-    point: tuple[Position, Position] | tuple[Position, Position, Position] = setting(
+    point: TwoOrThree[Position] = setting(
         (0.0, 0.0, 0.0), "the joint in the frame of the second interface, or in the world's [m]"
     )
-    rpy: tuple[Angle, Angle, Angle] = setting(
+    rpy: Three[Angle] = setting(
         (0.0, 0.0, 0.0),
         "roll, pitch and yaw of the joint's frame there, as of [[joints]]; zero: "
         "parallel to the first interface's frame [rad]",
     )
-    axis: Line | tuple[Component, Component, Component] | None = setting(
+    axis: Line | Three[Component] | None = setting(
         None,
         "of a pin in space, a slider, or the universal joint's axis on the second "
         "interface, in the joint's frame, of any length [-]",
@@ -102,7 +100,7 @@ class Closures(Table):
     stiffness: float = setting(
         0.0, "of a rod that is a spring; 0: it is rigid [N/m]", ge=0, le=1e15
     )
-    damping: Gain = setting(0.0, "of a rod that is a spring [N s/m]")
+    damping: Stiffness = setting(0.0, "of a rod that is a spring [N s/m]")
 
     @property
     def driven(self) -> bool:

@@ -7,9 +7,21 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator
 
-from dolfinopt.scene.tables.base import Length, Position, Refusal, Table, Use, setting, shown
+from dolfinopt.scene.tables.base import (
+    Inertia,
+    Length,
+    Position,
+    Refusal,
+    Six,
+    Stiffness,
+    Table,
+    Three,
+    Use,
+    setting,
+    shown,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,8 +31,8 @@ if TYPE_CHECKING:
     from dolfinopt.scene.tables.machine import Joint
 
 INBOARD, OUTBOARD = "inboard", "outboard"
-Point = tuple[Position, Position, Position]
-Vector = tuple[float, float, float]
+Point = Three[Position]
+Vector = Three[float]
 Components = TypeVar("Components", bound=tuple[float, ...])
 
 
@@ -227,8 +239,6 @@ def in_frame(arm: Arm, point: Point) -> Point:
 
 # -- gear, motor, bearing and friction: keys that [[arms]] and [[joints]] share -------------------
 
-Inertia = Annotated[float, Field(ge=0, le=1e9)]  # kg m2
-Ratio = Annotated[float, Field(ge=1e-3, le=1e6)]
 RotorInertia = Annotated[
     Inertia,
     setting(
@@ -237,10 +247,12 @@ RotorInertia = Annotated[
     ),
 ]
 GearRatio = Annotated[
-    Ratio | None,
+    float | None,
     setting(
         "revolutions of the rotor per revolution of the joint, against what the joint "
-        "sits on; of a prismatic joint in space radians per metre; stated with rotor_inertia [-]"
+        "sits on; of a prismatic joint in space radians per metre; stated with rotor_inertia [-]",
+        ge=1e-3,
+        le=1e6,
     ),
 ]
 GearStiffness = Annotated[
@@ -266,10 +278,8 @@ def _zero_for_inf(values: Any) -> Any:
     return tuple(0.0 if isinstance(x, float) and x == math.inf else x for x in values)
 
 
-_Stiffness = Annotated[float, Field(ge=0, le=1e15)]
-_Six = tuple[_Stiffness, _Stiffness, _Stiffness, _Stiffness, _Stiffness, _Stiffness]
 BearingStiffness = Annotated[
-    _Six | None,
+    Six[Stiffness] | None,
     BeforeValidator(_zero_for_inf),
     setting(
         "springs of the joint's bearing along x, y, z and about x, y, z of the "
@@ -278,11 +288,11 @@ BearingStiffness = Annotated[
     ),
 ]
 BearingDamping = Annotated[
-    _Six | None,
+    Six[Stiffness] | None,
     setting("dampers beside bearing_stiffness, in the same order [N s/m, N m s/rad]"),
 ]
 Friction = Annotated[
-    tuple[_Stiffness, _Stiffness] | None,
+    tuple[Stiffness, Stiffness] | None,
     setting(
         "viscous coefficient f_v and Coulomb friction f_c at the motor, as the joint "
         "feels them: f_v v + f_c tanh(v / friction_speed) against its speed v "
@@ -309,8 +319,8 @@ OUT_OF_PLANE = {2: "along z", 3: "about x", 4: "about y"}
 
 
 class _Table(Protocol):
-    bearing_stiffness: _Six | None
-    bearing_damping: _Six | None
+    bearing_stiffness: Six[Stiffness] | None
+    bearing_damping: Six[Stiffness] | None
 
 
 # What a joint has with another part alone.
@@ -357,8 +367,8 @@ class JointParts:
     damping: float
     rotor: float
     ratio: float
-    bearing: tuple[_Six, _Six] | None
-    friction: tuple[float, float, float] | None
+    bearing: tuple[Six[Stiffness], Six[Stiffness]] | None
+    friction: Three[float] | None
 
 
 DRIVE_KEYS = ("rotor_inertia", "gear_ratio", *PART_KEYS)

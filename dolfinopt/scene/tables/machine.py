@@ -6,13 +6,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from dolfinopt.scene.tables.arms import Moment, Tensor, check_arm_name, tensor_problem
+from dolfinopt.scene.tables.arms import Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import (
+    Angle,
+    Component,
+    DriveForce,
     FileName,
+    Inertia,
     Loc,
     Position,
     Refusal,
+    Stiffness,
     Table,
+    Three,
+    TwoOrThree,
     Use,
     refuse_count,
     setting,
@@ -43,11 +50,7 @@ if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
 JointType = Literal["revolute", "prismatic", "fixed"]
-Component = Annotated[float, Field(ge=-1e6, le=1e6)]
-Direction = Annotated[tuple[Component, Component, Component], AfterValidator(check_direction)]
-Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
-Coordinate = Annotated[float, Field(ge=-1e4, le=1e4)]  # m, rad
-Limit = Annotated[float, Field(ge=1e-9, le=1e15)]  # rad/s, m/s; N m, N
+Direction = Annotated[Three[Component], AfterValidator(check_direction)]
 # What fixed joints do not have.
 OF_MOVING = ("axis", "passive", "position_limits", "velocity_limit", "effort_limit",
              *(key for key in DRIVE_KEYS if key not in OF_BEARINGS))  # fmt: skip
@@ -79,11 +82,11 @@ class Joint(Table):
     axis: Direction | None = setting(
         None, "axis in the joint's frame, of any length; of revolute and prismatic ones [-]"
     )
-    origin: tuple[Position, Position, Position] = setting(
+    origin: Three[Position] = setting(
         (0.0, 0.0, 0.0),
         "origin of the joint's frame in the parent's interface frame, or in the world's [m]",
     )
-    rpy: tuple[Angle, Angle, Angle] = setting(
+    rpy: Three[Angle] = setting(
         (0.0, 0.0, 0.0),
         "roll, pitch and yaw about the fixed axes x, y and z that place the joint's "
         "frame, as in URDF [rad]",
@@ -101,17 +104,17 @@ class Joint(Table):
     friction: Friction = None
     friction_speed: FrictionSpeed = FRICTION_SPEED
 
-    position_limits: tuple[Coordinate, Coordinate] | None = setting(
+    position_limits: tuple[Position, Position] | None = setting(
         None,
         "least and largest coordinate, as in URDF; a warning tells where the motion "
         "exceeds them [rad, m]",
     )
-    velocity_limit: Limit | None = setting(
+    velocity_limit: DriveForce | None = setting(
         None,
         "largest rate of the coordinate either way, as in URDF; a warning tells where "
         "the motion exceeds it [rad/s, m/s]",
     )
-    effort_limit: Limit | None = setting(
+    effort_limit: DriveForce | None = setting(
         None,
         "largest torque or force of the drive either way, as in URDF; a warning tells "
         "where the motion asks for more. The optimiser keeps control.limits and "
@@ -236,8 +239,6 @@ def _check_machine(scene: Scene) -> None:
 # -- `[control]` ---------------------------------------------------------------------------------
 
 FeedForward = Literal["rigid", "elastic", "tip", "none"]
-Gain = Annotated[float, Field(ge=0, le=1e15)]  # N/m, N m/rad; N s/m, N m s/rad
-DriveForce = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
 
 
 class Control(Table):
@@ -250,11 +251,11 @@ class Control(Table):
         "gear_stiffness to turn ahead of their joints by what the gears give; "
         '"tip": those of [feed_forward], with its joints as desired ones; or none [-]',
     )
-    stiffness: tuple[Gain, ...] = setting(
+    stiffness: tuple[Stiffness, ...] = setting(
         "proportional gain of every driven coordinate, the cart first, then the joints "
         "from the base outwards [N/m, N m/rad]"
     )
-    damping: tuple[Gain, ...] = setting(
+    damping: tuple[Stiffness, ...] = setting(
         "derivative gain of every driven coordinate [N s/m, N m s/rad]"
     )
     limits: tuple[DriveForce, ...] | None = setting(
@@ -304,12 +305,12 @@ class Payload(Table):
     IN_SPACE = "offset arm"
     NUMBERS = "inertia"
     mass: float = setting("point mass at the end-effector [kg]", ge=0, le=1e9)
-    inertia: Moment | Tensor = setting(
+    inertia: Inertia | Tensor = setting(
         0.0,
         "moment of inertia about its centre; in space about every axis, or the tensor "
         "xx, yy, zz, xy, xz, yz [kg m2]",
     )
-    offset: tuple[Position, Position, Position] = setting(
+    offset: Three[Position] = setting(
         (0.0, 0.0, 0.0), "its centre in the frame of the end-effector's interface; in space [m]"
     )
     arm: str | None = setting(
@@ -320,7 +321,7 @@ class Payload(Table):
 
     @property
     def moment(self) -> float:
-        """Moment of inertia in the plane, about z, kg m2."""
+        """Inertia of inertia in the plane, about z, kg m2."""
         return self.inertia[2] if isinstance(self.inertia, tuple) else self.inertia
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
@@ -337,10 +338,8 @@ class Payload(Table):
 
 
 ForceComponent = Annotated[float, Field(ge=-1e12, le=1e12)]  # N, N m
-Vector = (
-    tuple[ForceComponent, ForceComponent] | tuple[ForceComponent, ForceComponent, ForceComponent]
-)
-GivenMoment = ForceComponent | tuple[ForceComponent, ForceComponent, ForceComponent]
+Vector = TwoOrThree[ForceComponent]
+GivenMoment = ForceComponent | Three[ForceComponent]
 ForceFrame = Literal["world", "arm"]
 # Columns of a table besides t, by the machine's dimension.
 FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}

@@ -11,7 +11,15 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
-from dolfinopt.scene.tables.base import Refusal, Table, setting, shown
+from dolfinopt.scene.tables.base import (
+    Component,
+    Refusal,
+    Table,
+    Three,
+    TwoOrThree,
+    setting,
+    shown,
+)
 
 YoungModulus = Annotated[float, Field(ge=1.0, le=1e15)]  # Pa
 PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
@@ -20,17 +28,12 @@ AnyRatio = Annotated[float, Field(ge=-100, le=100)]
 MassDensity = Annotated[float, Field(ge=1e-12, le=1e6)]  # kg/m3; 2.7e-9 t/mm3, too
 YieldStrength = Annotated[float, Field(ge=1e-3, le=1e15)]  # Pa
 FibreAngle = Annotated[float, Field(ge=-6.3, le=6.3)]  # rad
-Component = Annotated[float, Field(ge=-1e6, le=1e6)]
 Quantity = Annotated[float, Field(ge=-1e15, le=1e15)]  # a key of a law of one's own
 
-YoungModuli = (
-    YoungModulus
-    | tuple[YoungModulus, YoungModulus]
-    | tuple[YoungModulus, YoungModulus, YoungModulus]
-)
-ShearModuli = YoungModulus | tuple[YoungModulus, YoungModulus, YoungModulus]
-PoissonRatios = PoissonRatio | AnyRatio | tuple[AnyRatio, AnyRatio, AnyRatio]
-Axis = tuple[Component, Component, Component]
+YoungModuli = YoungModulus | TwoOrThree[YoungModulus]
+ShearModuli = YoungModulus | Three[YoungModulus]
+PoissonRatios = PoissonRatio | AnyRatio | Three[AnyRatio]
+Axis = Three[Component]
 
 
 def check_material(name: str) -> str:

@@ -8,14 +8,18 @@ from pydantic import Field, model_validator
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import (
+    Angle,
     Duration,
     FileName,
     Frequency,
+    Instant,
     Length,
     Loc,
     Position,
     Refusal,
     Table,
+    Three,
+    TwoOrThree,
     Use,
     refuse_count,
     setting,
@@ -26,15 +30,12 @@ if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
     from dolfinopt.scene.tables.arms import Arm
 
-Point = tuple[Position, Position] | tuple[Position, Position, Position]
-JointValue = Annotated[float, Field(ge=-1e4, le=1e4)]  # rad, m
-Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
+Point = TwoOrThree[Position]
 PathKind = Literal["arc", "line", "points", "joints", "rotation"]
 TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
 Base = Literal["cart", "fixed"] | Position
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
-Gravity = tuple[Acceleration, Acceleration] | tuple[Acceleration, Acceleration, Acceleration]
-Instant = Annotated[float, Field(ge=0, le=1e5)]  # s
+Gravity = TwoOrThree[Acceleration]
 SHAPE_LIMIT = 0.2  # of coefficients: shares of the way by which a law may run ahead
 MOST_COEFFICIENTS = 8
 ShapeCount = Annotated[int, Field(ge=0, le=MOST_COEFFICIENTS)]
@@ -76,12 +77,12 @@ class Motion(Table):
     )
     start: Point = setting((-1.0, 0.0), "start point of the line; in space three numbers [m]")
     end: Point = setting((1.0, 0.0), "end point of the line; in space three numbers [m]")
-    rpy: tuple[Angle, Angle, Angle] | None = setting(
+    rpy: Three[Angle] | None = setting(
         None,
         "orientation of the end-effector along a line in space: roll, pitch and yaw "
         "about the world's axes x, y and z; default: free [rad]",
     )
-    initial_joints: tuple[JointValue, ...] | None = setting(
+    initial_joints: tuple[Position, ...] | None = setting(
         None,
         "joint coordinates near those at the start of an end-effector's path in "
         "space, or of closed loops, for [[joints]] that move, in the plane for all arms: which "

@@ -8,12 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
-from dolfinopt.scene.tables.base import Loc, Refusal, Table, refuse_count, setting, shown
+from dolfinopt.scene.tables.base import (
+    Instant,
+    Loc,
+    Refusal,
+    Six,
+    Table,
+    Three,
+    refuse_count,
+    setting,
+    shown,
+)
 from dolfinopt.scene.tables.responses import (
     DECLARED,
     LARGEST_LOAD,
     Declaration,
-    Delay,
     Direction,
     Frequency,
     Need,
@@ -39,8 +48,8 @@ Attached = Literal["rigid-body", "point-mass", "none"]
 Combination = Literal["sum", "worst"]
 WorstBy = Literal["compliance", "deviation"]
 MANY_CASES = 1000  # load cases that a motion may have however short it is
-Load = tuple[float, float, float]  # F_x N, F_y N, moment N m
-SpatialLoad = tuple[float, float, float, float, float, float]  # force N, moment N m
+Load = Three[float]  # F_x N, F_y N, moment N m
+SpatialLoad = Six[float]  # force N, moment N m
 # Of solid arms, if none is stated: forces across, and torsion.
 SPATIAL_LOADS: tuple[SpatialLoad, ...] = (
     (0.0, 1.0, 0.0, 0.0, 0.0, 0.0),
@@ -301,14 +310,14 @@ Limit = float | tuple[float | None, ...] | tuple[StiffnessCase, ...]
 class ConstraintOptions(Table):
     """Options of limits."""
 
-    settling_after: Delay = setting(
+    settling_after: Instant = setting(
         0.0, "time from the beginning of each rest after which settling counts [s]"
     )
     damping_below: Frequency | None = setting(
         None,
         "frequency below which poles count for constraints.damping_ratio; default: all do [Hz]",
     )
-    poles_at: tuple[Delay, ...] | None = setting(
+    poles_at: tuple[Instant, ...] | None = setting(
         None, "instants at which poles count; default: start, middle and end of the motion [s]"
     )
 

@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
-from dolfinopt.scene.tables.base import Loc, Refusal, Table, setting
+from dolfinopt.scene.tables.base import (
+    DriveForce,
+    Loc,
+    Refusal,
+    Table,
+    Three,
+    TwoOrThree,
+    setting,
+)
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -33,11 +41,9 @@ Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
 Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
 Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
 Angle = Annotated[float, Field(ge=1e-15, le=math.pi)]  # rad
-Delay = Annotated[float, Field(ge=0, le=1e5)]  # s
 Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
 Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
 Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
-Force = Annotated[float, Field(ge=1e-9, le=1e15)]  # N, N m
 Factor = Annotated[float, Field(ge=1e-3, le=1e3)]  # -
 Rate = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3
 Ratio = Annotated[float, Field(ge=-0.99, le=0.99)]  # -
@@ -48,11 +54,11 @@ class StiffnessCase(Table):
     """A static load on one arm, and how far it may move the arm's outboard interface."""
 
     arm: str = setting("name of the arm, which is clamped at its inboard interface [-]")
-    force: tuple[Component, Component] | tuple[Component, Component, Component] | None = setting(
+    force: TwoOrThree[Component] | None = setting(
         None,
         "force at the outboard interface in the arm's frame: two components, three of a solid [N]",
     )
-    moment: Component | tuple[Component, Component, Component] | None = setting(
+    moment: Component | Three[Component] | None = setting(
         None, "moment there: one number, of a solid three components [N m]"
     )
     displacement: Distance | None = setting(
@@ -281,7 +287,7 @@ DECLARED: dict[str, Declaration] = {
             limit=Limited(
                 "upper limits of the largest force of every drive, the cart's first, then the "
                 "joints' from the base outwards; inf leaves one without limit [N, N m]",
-                tuple[Force | None, ...],
+                tuple[DriveForce | None, ...],
                 options=(),
             ),
             options=("effort_weights",),
