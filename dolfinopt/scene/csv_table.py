@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.scene.text import read_text
 
 TIME = "t"  # the column that a table may have before all others, s
 
@@ -93,14 +93,7 @@ def last_instant(file: str) -> float | None:
 
 def _lines(file: str) -> list[tuple[int, list[str]]]:
     """Return the cells of the lines that count, with their numbers from 1."""
-    try:
-        text = Path(file).read_bytes().decode("utf-8-sig")  # spreadsheets add a byte order mark
-    except UnicodeDecodeError as error:
-        line = error.object.count(b"\n", 0, error.start) + 1
-        raise InputError(f"{file}: line {line}: not UTF-8; save the table as UTF-8") from None
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in the path
-        reason = getattr(error, "strerror", None) or "not a file name"
-        raise InputError(f"{file}: cannot be read ({reason}); name a table (CSV)") from None
+    text = read_text(file, "name a table (CSV)")
     numbered = enumerate(text.splitlines(), start=1)
     lines = [(k, x) for k, x in numbered if x.strip() and not x.lstrip().startswith("#")]
     first = lines[0][1] if lines else ""

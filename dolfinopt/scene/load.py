@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import pairwise
@@ -20,7 +18,6 @@ from typing import Any, get_origin
 from pydantic import ValidationError
 
 from dolfinopt.data import mesh_folder
-from dolfinopt.disk import check_regular
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.messages import (
@@ -37,7 +34,7 @@ from dolfinopt.scene.messages import (
     unknown_key,
     wrong_value,
 )
-from dolfinopt.scene.old_words import OLD_KEYS, read_old_words, rows, scaled
+from dolfinopt.scene.old_words import OLD_KEYS, read_old_words, scaled
 from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name, named_files
 from dolfinopt.scene.tables.arms import (
     JOINT_KEYS,
@@ -60,6 +57,7 @@ from dolfinopt.scene.tables.base import (
     cut,
     input_error,
     loc_of,
+    rows,
     shown,
     without_none,
 )
@@ -77,6 +75,7 @@ from dolfinopt.scene.tables.material import material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction
 from dolfinopt.scene.tables.objective import Objective, WorstBy
 from dolfinopt.scene.tables.responses import DECLARED
+from dolfinopt.scene.toml import read_toml, tomllib
 
 __all__ = [
     "FILE_KEYS",
@@ -92,12 +91,8 @@ __all__ = [
     "read_scene",
     "resolve_file",
     "scene_from_dict",
+    "tomllib",
 ]
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 # Arrays of tables whose entries --set addresses by name or number.
 NAMED: dict[str, type[Table]] = {
@@ -331,50 +326,6 @@ def resolve_file(source: str, value: str, key: str, where: str = "") -> str:
         f"{key} = {shown(value)}: expected the path of a file, from the scene's folder or the "
         f"working directory; found {tried}",
     )
-
-
-def read_toml(source: str) -> dict[str, Any]:
-    """Return the data of the TOML file `source`; raise InputError if there is none."""
-    text = _read_text(source)
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise input_error(source, "not a scene: arrays nested too deeply") from None
-    except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
-        raise input_error(source, _syntax_error(str(error), text)) from None
-
-
-def _read_text(source: str) -> str:
-    """Return the text of the file `source`; raise InputError if it cannot be read."""
-    remedy = "give the path of a scene file (TOML)"
-    try:
-        check_regular(Path(source))
-        return Path(source).read_bytes().decode("utf-8-sig")  # editors may add a byte order mark
-    except FileNotFoundError:
-        reason = f"no such file; {remedy}"
-    except IsADirectoryError:
-        reason = f"is a directory; {remedy}"
-    except PermissionError:
-        reason = "permission denied; make the file readable"
-    except OSError as error:
-        reason = f"cannot be read ({error.strerror}); {remedy}"
-    except UnicodeDecodeError as error:
-        line = error.object.count(b"\n", 0, error.start) + 1
-        reason = f"line {line}: not UTF-8; save the file as UTF-8"
-    except ValueError:  # a zero byte in the path
-        reason = f"not a file name; {remedy}"
-    raise input_error(source, reason)
-
-
-def _syntax_error(message: str, text: str) -> str:
-    """Move the place in the parser's message to its front: "line 3, column 5: not valid ..."."""
-    result = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
-    if not result:
-        return f"not valid TOML: {message}"
-    line, column = result.groups()
-    if line is None:
-        line, column = text.count("\n") + 1, len(text) - text.rfind("\n")
-    return f"line {line}, column {column}: not valid TOML: {message[: result.start()]}"
 
 
 def _copy_tables(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables import closures
+from dolfinopt.scene.tables.base import rows
 from dolfinopt.scene.tables.joints import INBOARD, OUTBOARD, site_of
 from dolfinopt.scene.tables.responses import OLD_KINDS, OLD_LIMITS
 
@@ -190,12 +191,6 @@ def in_new_words(key: str) -> str:
     if word is None or word.words:
         return key
     return f"{place}.{word.new.rpartition('.')[2]}" if word.is_renamed else word.new
-
-
-def rows(tree: Mapping[str, Any], key: str) -> list[Row]:
-    """Return the tables of an array of tables, or the only one."""
-    node = tree.get(key)
-    return [row for row in (node if isinstance(node, list) else [node]) if isinstance(row, dict)]
 
 
 def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:

@@ -110,9 +110,14 @@ class Scene(Table):
         return self._old_words
 
     @property
+    def places(self) -> dict[str, int]:
+        """Index of every arm by its name."""
+        return {arm.name: i for i, arm in enumerate(self.arms)}
+
+    @property
     def owners(self) -> tuple[int | None, ...]:
         """For every arm the index of the arm that has its design; None where there is none."""
-        index = {arm.name: i for i, arm in enumerate(self.arms)}
+        index = self.places
         return tuple(
             (index[str(arm.design)] if arm.shares else i) if arm.flexible else None
             for i, arm in enumerate(self.arms)
@@ -126,7 +131,7 @@ class Scene(Table):
     @property
     def patterns(self) -> dict[int, int]:
         """For every arm that repeats another's design scaled the index of that arm."""
-        index = {arm.name: i for i, arm in enumerate(self.arms)}
+        index = self.places
         return {i: index[a.pattern] for i, a in enumerate(self.arms) if a.pattern is not None}
 
     @property

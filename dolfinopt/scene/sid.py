@@ -349,25 +349,25 @@ class _Reader:
             return
         raise InputError(f"{self.path}, line {len(self.lines)}: the file ends, expected {expected}")
 
-    def block(self, name: str, once: Items, often: Items, found: dict[str, Any]) -> dict[str, Any]:
+    def block(self, name: str, once: Items, often: Items, items: dict[str, Any]) -> dict[str, Any]:
         """Read the items of a block up to its end; into `found` those that may stand once."""
         choices = ", ".join(map(repr, [*once, *often, f"end {name}"]))
         known = {key.lower(): key for key in (*once, *often)}
         while True:
             self.next(choices)
             if self.end == name.lower():
-                return found
+                return items
             if (key := known.get(self.name)) is None:
                 raise self.fail(choices)
-            if key in found:
+            if key in items:
                 raise self.fail(f"{key!r} only once")
             value = (once[key] if key in once else often[key])()
             if key in once:
-                found[key] = value
+                items[key] = value
 
-    def complete(self, found: Mapping[str, Any], names: Iterable[str], told: str) -> None:
+    def complete(self, items: Mapping[str, Any], names: Iterable[str], told: str) -> None:
         for name in names:
-            if name not in found:
+            if name not in items:
                 raise self.fail(f"{name!r} {told}")
 
     def real(self) -> float:

@@ -1,11 +1,45 @@
-"""Values of a scene as TOML."""
+"""TOML: files of scenes and their values."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
+import sys
 from collections.abc import Mapping
 from typing import Any
+
+from dolfinopt.scene.tables.base import input_error
+from dolfinopt.scene.text import read_text
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = ["read_toml", "toml_value", "tomllib"]
+
+
+def read_toml(source: str, remedy: str = "give the path of a scene file (TOML)") -> dict[str, Any]:
+    """Return the data of the TOML file `source`; raise InputError if there is none."""
+    text = read_text(source, remedy)
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise input_error(source, "not a scene: arrays nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
+        raise input_error(source, _syntax_error(str(error), text)) from None
+
+
+def _syntax_error(message: str, text: str) -> str:
+    """Move the place in the parser's message to its front: "line 3, column 5: not valid ..."."""
+    result = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
+    if not result:
+        return f"not valid TOML: {message}"
+    line, column = result.groups()
+    if line is None:
+        line, column = text.count("\n") + 1, len(text) - text.rfind("\n")
+    return f"line {line}, column {column}: not valid TOML: {message[: result.start()]}"
 
 
 def toml_value(value: Any) -> str:

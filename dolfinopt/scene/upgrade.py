@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import copy
 import re
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from dolfinopt.errors import InputError
-from dolfinopt.scene.load import read_toml, scene_from_dict
+from dolfinopt.scene.load import scene_from_dict
 from dolfinopt.scene.old_words import read_old_words
 from dolfinopt.scene.tables.closures import read_old_closure
-from dolfinopt.scene.toml import toml_value
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from dolfinopt.scene.toml import read_toml, toml_value, tomllib
 
 HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z0-9_.-]+)\s*\]{1,2}\s*(#.*)?$")
 KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")

@@ -101,7 +101,7 @@ def test_a_driven_rod_is_a_column(tmp_path):
         (TABLE.format(kind="pin", link="foot"), ("closures.0.links", "turned", "name rocker")),
         (TABLE.format(kind="pin", link="tool"), ("closures.0.links = 'tool'", "arms.interfaces")),
         (TABLE.replace("[0.25, 0, 0],", "[0.25, 0],"), ("closures.0.points", "two points")),
-        ("passive = [", ("cannot be read as TOML",)),
+        ("passive = [", ("not valid TOML",)),
     ],
 )
 def test_refused(tmp_path, table, words):

@@ -252,10 +252,10 @@ def test_bad_table(tmp_path, text, words):
 
 def test_file_that_cannot_be_read(tmp_path):
     for file, reason in (
-        (str(tmp_path), "Is a directory"),
-        (str(tmp_path / "absent.csv"), "No such file"),
+        (str(tmp_path), "is a directory"),
+        (str(tmp_path / "absent.csv"), "no such file"),
     ):
-        refusal(lambda: read_table(file, ("x", "y")), "cannot be read", reason)  # noqa: B023
+        refusal(lambda: read_table(file, ("x", "y")), reason, "a table (CSV)")  # noqa: B023
     with pytest.raises(InputError, match="not a file name"):
         read_table("a\0b", ("x", "y"))
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import difflib
 import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,6 +29,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
+from dolfinopt.scene.toml import read_toml
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -484,12 +484,6 @@ def places_of(
 
 # -- closed loops ----------------------------------------------------------------------------
 
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 SAME_PLACE = 1e-6  # m: a solid has an interface at a point no farther from it
 OWN = ("links", "points")
 
@@ -531,10 +525,7 @@ def read_loops(
     Raises:
         InputError: it cannot be read, or names what there is not.
     """
-    try:
-        data = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read as TOML: {error}") from None
+    data = read_toml(str(file), "name a table of closed loops (TOML)")
     if unknown := sorted(set(data) - {"passive", "closures"}):
         raise _refused(file, unknown[0], data[unknown[0]], "no such key; passive or [[closures]]")
     passive = data.get("passive", [])

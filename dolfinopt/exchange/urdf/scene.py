@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dolfinopt.errors import InputError
+from dolfinopt.exchange.standard_input import INERTIA
 from dolfinopt.exchange.urdf.file import implausible_inertias
 from dolfinopt.exchange.urdf.robot import (
     CELLS,
@@ -55,7 +56,6 @@ CENTRED = 0.04  # of height or thickness: offset of interfaces up to which nothi
 PASSIVE = 0.4  # of a solid's length: longest solid end
 SETTLING = 0.3  # of the motion's duration, simulated after it
 ROUNDING = 1e-15  # m, rad: less is written as zero
-INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # xx, yy, zz, xy, xz, yz
 LONGEST_NAME = 64
 
 

@@ -87,6 +87,12 @@ def loc_of(path: str | Loc) -> Loc:
     return tuple(int(part) if part.isdigit() else part for part in path.split("."))
 
 
+def rows(tree: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+    """Return the tables of an array of tables of a scene's data, or the only one."""
+    node = tree.get(key)
+    return [row for row in (node if isinstance(node, list) else [node]) if isinstance(row, dict)]
+
+
 def setting(*given: Any, **rules: Any) -> Any:
     """Return the field of a key: its default, if it has one, and what it means, with the unit.
 

@@ -21,6 +21,7 @@ from dolfinopt.scene.tables.base import (
     TwoOrThree,
     Use,
     input_error,
+    rows,
     setting,
 )
 from dolfinopt.scene.tables.joints import (
@@ -291,9 +292,9 @@ def take_old_keys(tree: dict[str, Any], table: Any, source: str) -> None:
     if not isinstance(table, dict):
         raise input_error(source, "closure: expected [[closures]], of which it is an older word")
     tree[OLD] = True  # messages name its keys
-    last = [arm.get("name") for arm in _rows(tree, "arms")][-1:]
+    last = [arm.get("name") for arm in rows(tree, "arms")][-1:]
     tree["closures"] = tree.get("closures") or [{"name": OLD, "between": [*last, GROUND]}]
-    for row in _rows(tree, "closures")[:1]:
+    for row in rows(tree, "closures")[:1]:
         before = _unit(row.get("axis"))
         row.update({"axis" if key == "direction" else key: x for key, x in table.items()})
         load = row.pop("force", None)
@@ -311,13 +312,7 @@ def take_old_keys(tree: dict[str, Any], table: Any, source: str) -> None:
 
 
 def _old_forces(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
-    return [force for force in _rows(tree, "forces") if force.get("name") == OLD]
-
-
-def _rows(tree: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
-    """Return the tables of an array of tables."""
-    rows = tree.get(key)
-    return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    return [force for force in rows(tree, "forces") if force.get("name") == OLD]
 
 
 def _unit(axis: Any) -> list[float]:
