@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
     NAMES_FILE,
+    ByDimension,
     FileName,
     Inertia,
     Length,
@@ -161,8 +162,7 @@ class Arm(Table):
         Use("mesh_size cell_shape mesh_scale", "mesh"),
         *OF_PARTS,
     )
-    IN_SPACE = "centre interfaces"
-    NUMBERS = "inertia"
+    BY_DIMENSION = ByDimension(in_space="centre interfaces", numbers="inertia")
 
     name: Annotated[str, AfterValidator(check_arm_name)] = setting(
         "unique name, used in files and messages [-]"

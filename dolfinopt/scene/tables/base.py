@@ -122,16 +122,27 @@ class Use(NamedTuple):
         return f"used only with {self.choice}" + f" = {values}" * bool(values)
 
 
+class ByDimension(NamedTuple):
+    """Keys of a table, separated by spaces, on which the machine's dimension has a say.
+
+    Attributes:
+        in_plane: have an effect in the plane alone.
+        in_space: have one with [[joints]] alone.
+        numbers: in the plane a number.
+        vectors: a number for every direction.
+    """
+
+    in_plane: str = ""
+    in_space: str = ""
+    numbers: str = ""
+    vectors: str = ""
+
+
 class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
 
     USES: ClassVar[tuple[Use, ...]] = ()
-    # Keys, separated by spaces, that have an effect in the plane alone; with [[joints]] alone;
-    # whose value in the plane is a number; whose value has one for every direction.
-    IN_PLANE: ClassVar[str] = ""
-    IN_SPACE: ClassVar[str] = ""
-    NUMBERS: ClassVar[str] = ""
-    VECTORS: ClassVar[str] = ""
+    BY_DIMENSION: ClassVar[ByDimension] = ByDimension()
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -200,17 +211,17 @@ class Table(BaseModel):
 
     def _check_dimension(self, scene: Scene) -> None:
         """Refuse keys, and shapes of values, that the machine has no use for."""
-        spatial = scene.is_spatial
+        spatial, keys = scene.is_spatial, self.BY_DIMENSION
         where = "with [[joints]]: the machine moves in space"
         if not spatial:
             where = "without [[joints]]: the machine moves in the plane"
-        for key in (self.IN_PLANE if spatial else self.IN_SPACE).split():
+        for key in (keys.in_plane if spatial else keys.in_space).split():
             self.refuse_stated(f".{key}", where, "joints")
-        for key in self.NUMBERS.split():
+        for key in keys.numbers.split():
             if isinstance(getattr(self, key), tuple) and not spatial:
                 raise Refusal(f"expected a number {where}", f".{key}")
         numbers = "three numbers" if spatial else "two numbers"
-        for key in self.VECTORS.split():
+        for key in keys.vectors.split():
             value = getattr(self, key)
             if value != type(self).model_fields[key].default and len(value) != scene.dimension:
                 raise Refusal(f"expected an array of {numbers} {where}", f".{key}")

@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 from dolfinopt.scene.tables.arms import Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import (
     Angle,
+    ByDimension,
     Component,
     DriveForce,
     FileName,
@@ -302,8 +303,7 @@ class Damping(Table):
 class Payload(Table):
     """What the end-effector carries."""
 
-    IN_SPACE = "offset arm"
-    NUMBERS = "inertia"
+    BY_DIMENSION = ByDimension(in_space="offset arm", numbers="inertia")
     mass: float = setting("point mass at the end-effector [kg]", ge=0, le=1e9)
     inertia: Inertia | Tensor = setting(
         0.0,
@@ -348,8 +348,7 @@ FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 class Force(Table):
     """A force and a moment on an interface of an arm, constant or from a table over time."""
 
-    NUMBERS = "moment"
-    VECTORS = "force"
+    BY_DIMENSION = ByDimension(numbers="moment", vectors="force")
     name: Annotated[str, AfterValidator(check_joint_name)] | None = setting(
         None, "unique name, by which changes may call it [-]"
     )

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import (
     Angle,
+    ByDimension,
     Duration,
     FileName,
     Frequency,
@@ -48,9 +49,11 @@ PROFILES = ("trapezoidal", "s-curve")  # laws that are shaped by the limits
 class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
 
-    IN_PLANE = "base cart_follow cart_mass joint_height elbow"
-    IN_SPACE = "rpy"
-    VECTORS = "gravity start end"
+    BY_DIMENSION = ByDimension(
+        in_plane="base cart_follow cart_mass joint_height elbow",
+        in_space="rpy",
+        vectors="gravity start end",
+    )
     USES = (
         Use("radius flattening", "path", "arc"),
         Use("start end rpy", "path", "line"),

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
+    ByDimension,
     Instant,
     Loc,
     Refusal,
@@ -64,7 +65,7 @@ Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 class Objective(Table):
     """What is minimised."""
 
-    IN_PLANE = "elbow_angle"
+    BY_DIMENSION = ByDimension(in_plane="elbow_angle")
 
     kind: ObjectiveKind = setting(
         "esl",
