@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,8 +29,13 @@ if TYPE_CHECKING:
 
 NAME = CHECKPOINT
 SEAL = "digest"  # of all other arrays
-# Numbers of the best design.
+# Fields that the file has as JSON, which keeps every bit of a number: of `Memory`, and of its best
+# design; of a solution those that are arrays.
+PLAIN = (
+    "iteration", "change", "reach", "returned_to", "mma_steps", "gradient", "beta", "exact_from",
+)  # fmt: skip
 BEST = "iteration", "beta", "objective", "excess", "crisp"
+SOLUTION = "time_grid", "nodes", "q", "qd", "a"
 # Keys a resumed run may change: when to stop, and how to go on from where it is.
 MAY_CHANGE = {
     *(f"optimizer.{key}" for key in ("max_iterations", "tolerance", "kkt_tolerance")),
@@ -47,7 +53,7 @@ def _scene_text(scene: Scene) -> str:
 def begin(folder: Path, scene: Scene) -> None:
     """Write the checkpoint of a run that has done nothing yet, and nothing else (root only)."""
     remove_stale(folder)
-    _sealed(folder, {**_stamp(scene), "iteration": np.array(-1)})
+    _sealed(folder, _stamp(scene))
 
 
 def _stamp(scene: Scene) -> dict[str, np.ndarray]:
@@ -68,30 +74,10 @@ def save(
     folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm], memory: Memory
 ) -> None:
     """Replace the checkpoint atomically (collective)."""
-    number = len(scene.arms) + 1
-    arrays = arrays_of(partition, arms, memory, number)
+    arrays = _of_arms(partition, arms, memory, len(scene.arms) + 1)
     with together(partition.world):
         if partition.world.rank == 0:
-            _write(folder, scene, memory, arrays)
-
-
-def _write(folder: Path, scene: Scene, memory: Memory, arrays: dict[str, Any]) -> None:
-    """Write the file, with the designs' `arrays` (root only)."""
-    arrays = {
-        **_stamp(scene),
-        **arrays,
-        "history": np.array([row.values for row in memory.history]),
-        "history_columns": np.array(memory.history[0].columns),
-        "initial_deviation": memory.initial_deviation,
-        "exact_from": -1 if memory.exact_from is None else memory.exact_from,
-    }
-    if memory.choice is not None:
-        arrays["coordinates"] = memory.choice.coordinates
-        arrays["tried"] = np.array(memory.choice.tried)
-    if memory.stiffening is not None:
-        estimate = memory.stiffening.estimate
-        arrays["stiffening"] = [np.nan if estimate is None else estimate, memory.stiffening.on]
-    _sealed(folder, {key: np.asarray(value) for key, value in arrays.items()})
+            _sealed(folder, {**_stamp(scene), **arrays, **_of_run(memory)})
 
 
 def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -100,6 +86,7 @@ def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return what stands for names, types, shapes and values of arrays."""
     result = hashlib.blake2b(digest_size=16)
     for key in sorted(arrays):
         array = arrays[key]
@@ -124,34 +111,10 @@ def load(
         InputError: no checkpoint, a damaged one, or one of another scene.
     """
     arrays = on_root(partition.world, _read, folder, scene)
-    if int(arrays["iteration"]) < 0:
+    if "state" not in arrays:
         return None
     with together(partition.world):
         return _memory(arrays, arms)
-
-
-def _memory(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> Memory:
-    """Return the checkpoint's memory, cells and modes of this rank's arms."""
-    columns = arrays["history_columns"].tolist()
-    history = [HistoryRow.from_values(columns, row.tolist()) for row in arrays["history"]]
-    choice = None
-    if "coordinates" in arrays:
-        tried = tuple((int(number), float(error)) for number, error in arrays["tried"])
-        count = int(arrays["coordinates"])
-        choice = OrderSelection(count, dict(tried)[count], tried)
-    stiffening = None
-    if "stiffening" in arrays:
-        estimate, on = arrays["stiffening"].tolist()
-        stiffening = Stiffening(None if np.isnan(estimate) else estimate, bool(on))
-    exact_from = int(arrays["exact_from"])
-    return Memory(
-        **fields_from(arrays, arms),
-        history=history,
-        initial_deviation=arrays["initial_deviation"],
-        exact_from=None if exact_from < 0 else exact_from,
-        choice=choice,
-        stiffening=stiffening,
-    )
 
 
 def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
@@ -168,8 +131,6 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
         if str(arrays.pop(SEAL)) != _digest(arrays):
             raise ValueError("it was changed")
         theirs = json.loads(str(arrays["scene"]))
-        if int(arrays["iteration"]) >= 0:
-            arrays["history_columns"], arrays["last"]  # those of earlier versions have none
     except Exception as error:  # whatever a foreign or damaged file may raise
         raise InputError(
             f"{path}: --resume cannot read this checkpoint ({type(error).__name__}); start "
@@ -207,105 +168,106 @@ def _difference(theirs: Any, ours: Any) -> str:
     return ""
 
 
-# -- one design of an optimisation as arrays of whole arms, for the checkpoint, and back ---------
-
-# A solution's arrays: name in the file, field.
-SOLUTION = {"edges": "time_grid", "nodes": "nodes", "q": "q", "qd": "qd", "a": "a"}
+# -- the memory as arrays of whole arms, and back ------------------------------------------------
 
 
-def arrays_of(
-    partition: Partition, arms: Mapping[int, Arm], memory: Memory, number: int
-) -> dict[str, Any]:
-    """Return the arrays of one design, of whole arms (collective; complete on the root).
-
-    Args:
-        number: of sets of modes.
-    """
-    with together(partition.world):
-        points = {k: _interior_points(arm) for k, arm in arms.items()}
-        known = [
-            {k: _rows(arm, memory.modes[k], j) for k, arm in arms.items()} for j in range(number)
-        ]
-    columns: dict[str, Mapping[int, Any]] = {
-        "centroid": gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()}),
-        "cells": gather_cells(partition, {k: x for k, x in memory.cells.items() if k != LAW}),
-        "points": gather_cells(partition, points),
+def _of_run(memory: Memory) -> dict[str, np.ndarray]:
+    """Return what does not belong to single arms (root only)."""
+    state: dict[str, Any] = {name: getattr(memory, name) for name in PLAIN}
+    state |= {
+        "best": {name: getattr(memory.best, name) for name in BEST},
+        "progress": asdict(memory.progress),
+        "columns": memory.history[0].columns,
+        "rows": [row.values for row in memory.history],
+        "choice": None if memory.choice is None else asdict(memory.choice),
+        "stiffening": None if memory.stiffening is None else asdict(memory.stiffening),
+        "solutions": [(item.error, item.strategy.name) for item in memory.solutions],
     }
-    for j, by_arm in enumerate(known):
-        columns[f"modes{j}"] = gather_cells(partition, {k: rows for k, (rows, _) in by_arm.items()})
-        columns[f"outboard{j}"] = gather_cells(
-            partition, {k: last for k, (_, last) in by_arm.items()}
-        )
-    if partition.world.rank != 0:
-        return {}
-    arrays: dict[str, Any] = {
-        "iteration": memory.iteration,
-        "last": [memory.change, memory.reach, memory.returned_to, memory.mma_steps],
-        "gradient": memory.gradient,
+    arrays = {
+        "state": np.array(json.dumps(state, default=lambda number: number.item())),
         "multipliers": memory.multipliers,
-        "course": [memory.progress.objectives, memory.progress.excesses],
-        "since": memory.progress.since,
-        "best": [getattr(memory.best, name) for name in BEST],
-        "sharpness": memory.beta,
         "law": memory.cells[LAW],
+        "initial_deviation": memory.initial_deviation,
     }
     for k, solution in enumerate(memory.solutions):
-        for name, field in (*SOLUTION.items(), ("error", "error")):
-            arrays[f"solution{k}/{name}"] = getattr(solution, field)
-        arrays[f"solution{k}/strategy"] = solution.strategy.name
-    for key, by_arm in columns.items():
-        arrays |= {f"arm{k}/{key}": value for k, value in by_arm.items()}
+        arrays |= {f"solution{k}/{name}": getattr(solution, name) for name in SOLUTION}
     return arrays
 
 
-def fields_from(arrays: Mapping[str, Any], arms: Mapping[int, Arm]) -> dict[str, Any]:
-    """Return the fields of `Memory`."""
-    cells = {LAW: np.asarray(arrays["law"])}
-    modes: dict[int, list[np.ndarray]] = {}
+def _of_arms(
+    partition: Partition, arms: Mapping[int, Arm], memory: Memory, number: int
+) -> dict[str, np.ndarray]:
+    """Return cells, nodes and `number` sets of modes of whole arms, on the root (collective)."""
+    with together(partition.world):
+        own = {k: _of_arm(arm, k, memory, number) for k, arm in arms.items()}
+    names = ["centroid", "points", "cells"]
+    names += [f"{part}{j}" for j in range(number) for part in ("modes", "outboard")]
+    arrays: dict[str, np.ndarray] = {}
+    for name in names:
+        columns = gather_cells(partition, {k: x[name] for k, x in own.items() if name in x})
+        arrays |= {f"arm{k}/{name}": column for k, column in columns.items()}
+    return arrays
+
+
+def _of_arm(arm: Arm, index: int, memory: Memory, number: int) -> dict[str, np.ndarray]:
+    """Return this rank's rows of one arm's arrays."""
+    arrays = {"centroid": arm.mesh.centroid, "points": _interior_points(arm)}
+    if index in memory.cells:  # an arm that repeats another's design has no variables
+        arrays["cells"] = memory.cells[index]
+    for j in range(number):
+        arrays[f"modes{j}"], arrays[f"outboard{j}"] = _rows(arm, memory.modes[index], j)
+    return arrays
+
+
+def _memory(arrays: Mapping[str, np.ndarray], arms: Mapping[int, Arm]) -> Memory:
+    """Return the checkpoint's memory, cells and modes of this rank's arms."""
+    state = json.loads(str(arrays["state"]))
+    cells = {LAW: arrays["law"]}
     for k, arm in arms.items():
-        if f"arm{k}/cells" in arrays:  # an arm that repeats another's design has no variables
+        if f"arm{k}/cells" in arrays:
             rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
             cells[k] = arrays[f"arm{k}/cells"][rows]
-        rows = _match(arrays[f"arm{k}/points"], _interior_points(arm))
-        rows = (arm.mesh.dim * rows[:, None] + np.arange(arm.mesh.dim)).ravel()
-        last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
-        modes[k] = []
-        for j in range(len(arm.initial_vectors)):
-            interior, outboard = (arrays[f"arm{k}/{part}{j}"] for part in ("modes", "outboard"))
-            modes[k].append(np.vstack([interior[rows], outboard if last else outboard[:0]]))
-    solutions: list[Solution] = []
-    while f"solution{len(solutions)}/error" in arrays:
-        of = f"solution{len(solutions)}"
-        parts = {field: arrays[f"{of}/{name}"] for name, field in SOLUTION.items()}
-        error, strategy = float(arrays[f"{of}/error"]), Strategy[str(arrays[f"{of}/strategy"])]
-        solutions.append(Solution(**parts, error=error, iterations=0, strategy=strategy))
-    change, reach, returned_to, mma_steps = arrays["last"].tolist()
-    objectives, excesses = map(tuple, arrays["course"].tolist())
-    best = dict(zip(BEST, arrays["best"].tolist(), strict=True))
-    best["iteration"] = int(best["iteration"])
-    best["crisp"] = bool(best["crisp"])
-    return {
-        "iteration": int(arrays["iteration"]),
-        "change": change,
-        "reach": reach,
-        "returned_to": int(returned_to),
-        "mma_steps": int(mma_steps),
-        "gradient": str(arrays["gradient"]),
-        "cells": cells,
-        "modes": modes,
-        "multipliers": arrays["multipliers"],
-        "best": Best(x=np.empty(0), **best),
-        "progress": Progress(objectives, excesses, int(arrays["since"])),
-        "solutions": tuple(solutions),
-        "beta": float(arrays["sharpness"]),
-    }
+    solutions = []
+    for k, (error, strategy) in enumerate(state["solutions"]):
+        parts: Any = {name: arrays[f"solution{k}/{name}"] for name in SOLUTION}
+        solutions.append(Solution(**parts, error=error, iterations=0, strategy=Strategy[strategy]))
+    progress, choice, stiffening = state["progress"], state["choice"], state["stiffening"]
+    if choice is not None:
+        choice = OrderSelection(**choice | {"tried": tuple(map(tuple, choice["tried"]))})
+    return Memory(
+        **{name: state[name] for name in PLAIN},
+        cells=cells,
+        modes={k: _modes(arrays, k, arm) for k, arm in arms.items()},
+        multipliers=arrays["multipliers"],
+        best=Best(x=np.empty(0), **state["best"]),
+        progress=Progress(
+            tuple(progress["objectives"]), tuple(progress["excesses"]), progress["since"]
+        ),
+        solutions=tuple(solutions),
+        history=[HistoryRow.from_values(state["columns"], row) for row in state["rows"]],
+        initial_deviation=arrays["initial_deviation"],
+        choice=choice,
+        stiffening=None if stiffening is None else Stiffening(**stiffening),
+    )
+
+
+def _modes(arrays: Mapping[str, np.ndarray], index: int, arm: Arm) -> list[np.ndarray]:
+    """Return this rank's rows of an arm's sets of modes; its last rank has the interface's."""
+    nodes = _match(arrays[f"arm{index}/points"], _interior_points(arm))
+    rows = (arm.mesh.dim * nodes[:, None] + np.arange(arm.mesh.dim)).ravel()
+    is_last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
+    modes = []
+    for j in range(len(arm.initial_vectors)):
+        interior, outboard = (arrays[f"arm{index}/{part}{j}"] for part in ("modes", "outboard"))
+        modes.append(np.vstack([interior[rows], outboard if is_last else outboard[:0]]))
+    return modes
 
 
 def _rows(arm: Arm, modes: Sequence[np.ndarray], j: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the interior rows of the j-th modes and those of the outboard interface, if any."""
     inner = arm.substructure.T.num_interior
-    whole = modes[j] if j < len(modes) else np.empty((inner, 0))
-    return whole[:inner], whole[inner:]
+    own = modes[j] if j < len(modes) else np.empty((inner, 0))
+    return own[:inner], own[inner:]
 
 
 def _interior_points(arm: Arm) -> np.ndarray:
