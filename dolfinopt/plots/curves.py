@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,16 +24,15 @@ from dolfinopt.plots.style import (
     headline,
     log_scale,
     look,
-    look_numbers,
     looks,
     new_figure,
     shortened,
-    spread,
     styled,
 )
-from dolfinopt.responses.response import constraints_of, find_limited
+from dolfinopt.progress import SHOWN
+from dolfinopt.responses.constraints import Limit
+from dolfinopt.responses.response import constraints_of
 from dolfinopt.scene.duration import path_length, time_law
-from dolfinopt.scene.tables.responses import DECLARED, VOLUME
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,6 +81,19 @@ def _head(axes: Axes, label: str, note: str) -> None:
 # -- history ---------------------------------------------------------------------------------
 
 
+# Columns of the history in the order of their panels: label, factor.
+HISTORY = {
+    "max_deviation": ("maximal deviation [mm]", MILLI),
+    "grayness": ("grayness [-]", 1.0),
+    "volume_fraction": ("volume fraction [-]", 1.0),
+    "change": ("largest change of the design [-]", 1.0),
+    "kkt": ("Karush-Kuhn-Tucker residual [-]", 1.0),
+    "merit": ("merit: objective and excesses of limits [-]", 1.0),
+}
+SHARES = ("grayness", "volume fraction")  # from 0 to 1, on one linear scale, also arm by arm
+Limits = Mapping[str, Limit]  # by their columns of history.csv, see `limits_by_column`
+
+
 def history_of(scene: Scene, rows: Sequence[HistoryRow]) -> Figure:
     """Return the picture of `history_figure` of a scene's optimisation, with its limits."""
     minimised = scene.objective.response
@@ -90,30 +102,66 @@ def history_of(scene: Scene, rows: Sequence[HistoryRow]) -> Figure:
 
 
 @styled
-def history_figure(
-    rows: Sequence[HistoryRow], objective_label: str, limits: Mapping[str, float] | None = None
-) -> Figure:
+def history_figure(rows: Sequence[HistoryRow], objective_label: str, limits: Limits) -> Figure:
     """Return the picture of what history.csv holds against the iteration.
 
     Args:
         rows: at least one.
         objective_label: name and unit of the objective.
-        limits: of constraints by their column, see `limits_by_column`.
+        limits: of the constraints.
     """
-    panels = history_panels(rows, objective_label)
+    panels = history_panels(rows, objective_label, limits)
     used = np.arange(2 * (-(-len(panels) // 2))).reshape(2, -1).T < len(panels)
     figure, grid = panel_grid(used, "History of the optimisation", "iteration")
     iteration = np.array([row.iteration for row in rows])
-    bounds = {}
-    for name, limit in (limits or {}).items():
-        label, factor = _drawn(name)
-        bounds[label] = factor * limit
     # Down the first column, then down the second.
-    for axes, (label, values) in zip(grid.T.ravel(), panels.items(), strict=False):
-        _draw_history_panel(axes, iteration, values, label, bounds.get(label))
+    for axes, (label, panel) in zip(grid.T.ravel(), panels.items(), strict=False):
+        _draw_history_panel(axes, iteration, label, *panel)
     grid[0, 0].set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
     grid[0, 0].xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
     return figure
+
+
+def history_panels(
+    rows: Sequence[HistoryRow], objective_label: str, limits: Limits
+) -> dict[str, tuple[np.ndarray, float | None]]:
+    """Return values (n,) and limit of every panel by its label; what is nowhere known is left out.
+
+    Both are in the unit that the label tells.
+    """
+    panels: dict[str, tuple[np.ndarray, float | None]] = {}
+    panels[objective_label] = np.array([row.objective for row in rows]), None
+    for name, (label, factor) in HISTORY.items():
+        if name != "max_deviation" or "deviation" not in limits:  # a panel of the same values
+            panels[label] = factor * np.array([getattr(row, name) for row in rows]), None
+    for name, limit in limits.items():
+        unit, factor = SHOWN.get(limit.unit, (limit.unit, 1.0))
+        values = factor * np.array([row.constraints.get(name, np.nan) for row in rows])
+        panels[f"{limit.words} [{unit}]"] = values, factor * limit.limit
+    return {label: panel for label, panel in panels.items() if np.isfinite(panel[0]).any()}
+
+
+def _draw_history_panel(
+    axes: Axes, iteration: np.ndarray, label: str, values: np.ndarray, limit: float | None
+) -> None:
+    """Draw one quantity, and its limit as a broken line; first and last value stand above it."""
+    is_share, positive = label.startswith(SHARES), values > 0.0
+    if not is_share and positive.any():  # nothing has changed yet at the first row
+        values = np.where(positive, values, np.nan)
+    marker = "o" if len(values) <= FEW_POINTS else ""
+    axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, clip_on=False)
+    shown = values[np.isfinite(values)]
+    _head(axes, label, " → ".join(f"{value:.4g}" for value in shown[[0, -1][: len(shown)]]))
+    if limit is not None:
+        axes.axhline(limit, color=LIMIT, ls="--", lw=1.0)
+        shown = np.append(shown, limit)
+    if is_share:
+        axes.set_ylim(0.0, 1.05 * max(1e-3, *shown))
+    elif shown.min() > 0.0:
+        log_scale(axes, shown)
+        if shown.max() <= 1.02 * shown.min():  # nothing but digits that do not matter
+            middle = float(np.sqrt(shown.min() * shown.max()))
+            axes.set_ylim(0.5 * middle, 2.0 * middle)
 
 
 @styled
@@ -126,100 +174,29 @@ def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
     alone is limited.
     """
     limits = limits_by_column(scene, rows[0].constraints)
-    if all(item.response.declared.of_nominal for item in constraints_of(scene)):
+    if all(limit.of_mass for limit in limits.values()):
         return None
     figure, grid = panel_grid(np.ones((2, 1), dtype=bool), "Limits of the design", "iteration")
     above, below = grid[:, 0]
     iteration = [row.iteration for row in rows]
     objective = np.array([abs(row.objective) or 1.0 for row in rows])
-    lower = {item.name for item in constraints_of(scene) if item.response.declared.lower}
     every = []
     for number, (name, limit) in enumerate(limits.items()):
         value = np.array([row.constraints[name] for row in rows])
-        least = any(name == key or name.startswith(f"{key}_") for key in lower)
-        used = 100.0 * (limit / value if least else value / limit)
+        used = 100.0 * (limit.limit / value if limit.least else value / limit.limit)
         eased = np.array([row.multipliers.get(name, np.nan) for row in rows]) / objective
-        label = shortened(constraint_label(name).partition(" [")[0])
-        every_tenth = max(1, len(rows) // 10)
-        above.plot(iteration, used, label=label, **look(number), markevery=every_tenth)
-        below.plot(iteration, eased, **look(number), markevery=every_tenth)
+        style: Any = look(number) | {"markevery": max(1, len(rows) // 10)}
+        above.plot(iteration, used, label=shortened(limit.words), **style)
+        below.plot(iteration, eased, **style)
         every.append(used)
     log_scale(above, np.append(np.concatenate(every), 100.0))
     above.axhline(100.0, color=LIMIT, ls="--", lw=1.0)
-    above.legend(ncols=3, loc="upper right")
+    above.legend(ncols=3)
     _head(above, "share of the limit that is used [%]", "limit: 100 %")
     _head(below, "objective gained for 1 % of the limit [%]", "")
     below.set_ylim(bottom=0.0)
     above.set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
     return figure
-
-
-# Columns of the history in the order of their panels: label, factor.
-HISTORY = {
-    "max_deviation": ("maximal deviation [mm]", MILLI),
-    "grayness": ("grayness [-]", 1.0),
-    "volume_fraction": ("volume fraction [-]", 1.0),
-    "change": ("largest change of the design [-]", 1.0),
-    "kkt": ("Karush-Kuhn-Tucker residual [-]", 1.0),
-    "merit": ("merit: objective and excesses of limits [-]", 1.0),
-}
-SHARES = ("grayness", "volume fraction")  # from 0 to 1, on one linear scale, also arm by arm
-# Units of constraints in pictures: ending of the label, its replacement, factor.
-DRAWN = (
-    (" [m]", " [mm]", MILLI),
-    (" [rad]", " [mrad]", MILLI),
-    (" [Pa]", " [MPa]", 1e-6),
-)
-
-
-def _drawn(constraint: str) -> tuple[str, float]:
-    """Return label and factor of a constraint's panel."""
-    label = constraint_label(constraint)
-    for unit, drawn, factor in DRAWN:
-        if label.endswith(unit):
-            return label.removesuffix(unit) + drawn, factor
-    return label, 1.0
-
-
-def history_panels(rows: Sequence[HistoryRow], objective_label: str) -> dict[str, np.ndarray]:
-    """Return label and values (n,) of every panel; what is nowhere known is left out."""
-    panels = {objective_label: np.array([row.objective for row in rows])}
-    limited = rows[0].constraints
-    for name, (label, factor) in HISTORY.items():
-        if name != "max_deviation" or "deviation" not in limited:  # a panel of the same values
-            panels[label] = factor * np.array([getattr(row, name) for row in rows])
-    for name in limited:
-        label, factor = _drawn(name)
-        values: Any = [row.constraints.get(name) for row in rows]
-        panels[label] = factor * np.array(values, dtype=float)
-    return {label: values for label, values in panels.items() if np.isfinite(values).any()}
-
-
-def _draw_history_panel(
-    axes: Axes, iteration: np.ndarray, values: np.ndarray, label: str, limit: float | None = None
-) -> None:
-    """Draw one quantity, and its limit as a broken line; first and last value stand above it."""
-    linear = label.startswith(SHARES)
-    positive = values > 0.0
-    if not linear:  # nothing has changed yet at the first row; zero has no logarithm
-        values = np.where(positive, values, np.nan) if positive.any() else values
-    marker = "o" if len(values) <= FEW_POINTS else ""
-    axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, clip_on=False)
-    finite, ends = values[np.isfinite(values)], ""
-    if limit is not None:
-        axes.axhline(limit, color=LIMIT, ls="--", lw=1.0)
-    if len(finite):
-        ends = f"{finite[0]:.4g}" if len(finite) == 1 else f"{finite[0]:.4g} → {finite[-1]:.4g}"
-    _head(axes, label, ends)
-    if limit is not None and len(finite):
-        finite = np.append(finite, limit)
-    if linear:
-        axes.set_ylim(0.0, 1.05 * max(1e-3, *finite))
-    elif len(finite) and finite.min() > 0.0:
-        log_scale(axes, finite)
-        if finite.max() <= 1.02 * finite.min():  # nothing but digits that do not matter
-            middle = float(np.sqrt(finite.min() * finite.max()))
-            axes.set_ylim(0.5 * middle, 2.0 * middle)
 
 
 # -- deviation -------------------------------------------------------------------------------
@@ -249,8 +226,6 @@ def deviation_figure(
 ) -> Figure:
     """Return the picture of the end-effector's distance from its rigid or desired path.
 
-    What a curve is stands at its peak.
-
     Args:
         t: (n,) s.
         deviation: (n, d) m.
@@ -260,36 +235,28 @@ def deviation_figure(
     """
     figure = new_figure(9.0, 5.0)
     axes = figure.add_axes((0.1, 0.11, 0.88, 0.81))  # room for ticks such as 0.00025
-    curves = [("", t, deviation)]
+    curves = {"": (t, deviation)}
     if initial is not None and len(initial):
-        times = np.linspace(t[0], t[-1], len(initial))
-        curves = [(INITIAL, times, initial), (OPTIMISED, t, deviation)]
-    distances = [MILLI * lengths(vectors) for _, _, vectors in curves]
-    largest = [float(d.max()) for d in distances] + [MILLI * limit[0] for limit in limits]
-    top = 1.1 * max(largest) or 1.0
-    heights = spread([float(d.max()) / top for d in distances], 0.07)
-    # A curve alone looks like the optimised design's.
-    numbers = look_numbers([[label for label, _, _ in curves]]) if len(curves) > 1 else {"": 0}
-    for (label, times, _), distance, height in zip(curves, distances, heights, strict=True):
-        worst = int(np.argmax(distance))
-        style = look(numbers[label]) | {"marker": "o", "markevery": [worst], "clip_on": False}
-        axes.plot(times, distance, label=label, **style)
-        when = float(times[worst])
-        late = when > 0.5 * (t[0] + t[-1])
-        note = f"{label}: largest" if label else "largest"
-        axes.annotate(
-            f"{note} {distance[worst]:.3g} mm at {when:.3f} s",
-            xy=(when, distance[worst]),
-            xytext=((when - t[0]) / (t[-1] - t[0]) + (-0.02 if late else 0.02), height + 0.02),
-            textcoords="axes fraction",
-            ha="right" if late else "left",
-            color=style["color"],
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
-        )
+        even = np.linspace(t[0], t[-1], len(initial))
+        curves = {INITIAL: (even, initial), OPTIMISED: (t, deviation)}
+    styles = looks([list(curves)]) if len(curves) > 1 else {"": look(0)}  # as the optimised design
+    for name, (times, vectors) in curves.items():
+        _draw_distance(axes, name, times, MILLI * lengths(vectors), styles[name])
     _over_time(axes, t, "deviation [mm]", limits)
-    axes.set(ylim=(0.0, top), xlabel="time [s]")
+    axes.set(ylim=(0.0, 1.1 * axes.dataLim.y1 or 1.0), xlabel="time [s]")
     axes.set_title(title, fontsize=TITLE)
+    axes.legend()
     return figure
+
+
+def _draw_distance(
+    axes: Axes, name: str, t: np.ndarray, distance: np.ndarray, style: Mapping[str, Any]
+) -> None:
+    """Draw a distance (n,), mm, its largest value marked and told in the legend."""
+    worst = int(np.argmax(distance))
+    note = f"largest {distance[worst]:.4g} mm at {t[worst]:.3f} s"
+    mark = {"marker": "o", "markevery": [worst], "clip_on": False}
+    axes.plot(t, distance, label=": ".join(filter(None, (name, note))), **{**style, **mark})
 
 
 @styled
@@ -303,14 +270,12 @@ def check_figure(check: Check, scene: Scene) -> Figure:
     lower = figure.add_axes((0.1, 0.09, 0.88, 0.24))
     first, styles = check.density.trajectory, looks([list(check.columns)])
     for name, column in check.columns.items():
-        style, own = styles[name] | {"marker": ""}, column.trajectory
+        own = column.trajectory
         distance = MILLI * own.distance
-        worst = int(np.argmax(distance))
-        note = f"{name}: largest {distance[worst]:.4g} mm at {own.t[worst]:.3f} s"
-        upper.plot(own.t, distance, label=note, **style)
+        _draw_distance(upper, name, own.t, distance, styles[name])
         if column is not check.density:
             base = first if np.array_equal(first.t, own.t) else first.at(own.t)
-            less = distance - MILLI * base.distance
+            less, style = distance - MILLI * base.distance, styles[name] | {"marker": ""}
             lower.plot(own.t, less, label=f"{name} less density", **style)
     _over_time(upper, first.t, "deviation [mm]", deviation_limits(scene))
     _over_time(lower, first.t, "difference [mm]")
@@ -415,9 +380,8 @@ def law_figure(scene: Scene) -> Figure:
     units = ("-", "1/s", "1/s2") if motion.path == "rotation" else ("m", "m/s", "m/s2")
     laws = {"designed": time_law(motion), motion.law: time_law(plain)}
     values = {name: law(t, motion.duration) for name, law in laws.items()}
-    for k, (axes, word) in enumerate(
-        zip(grid[:, 0], ("way", "speed", "acceleration"), strict=True)
-    ):
+    for k, word in enumerate(("way", "speed", "acceleration")):
+        axes = grid[k, 0]
         for (name, value), colour in zip(values.items(), (BLUE, ORANGE), strict=False):
             axes.plot(t, length * value[k], color=colour, label=name)
         axes.set_xlim(t[0], t[-1])
@@ -430,26 +394,16 @@ def law_figure(scene: Scene) -> Figure:
 # -- limits by the columns of the history, and over time ----------------------------------------
 
 
-def constraint_label(name: str) -> str:
-    """Return e.g. "first frequency of arm2 [Hz]" for the column first_frequency_arm2."""
-    for quantity in (
-        VOLUME.name,
-        *(response.key for response in DECLARED.values() if response.key),
-    ):
-        if name == quantity or name.startswith(f"{quantity}_"):
-            arm = name[len(quantity) + 1 :]
-            unit = find_limited(quantity).unit_of(arm)
-            return quantity.replace("_", " ") + (f" of {arm}" if arm else "") + f" [{unit}]"
-    return name
-
-
-def limits_by_column(scene: Scene, columns: Iterable[str]) -> dict[str, float]:
-    """Return the limit of every column of history.csv that is a constraint's."""
-    result: dict[str, float] = {}
+def limits_by_column(scene: Scene, values: Mapping[str, float]) -> dict[str, Limit]:
+    """Return the limits of constraints whose values are given by their columns of history.csv."""
+    result: dict[str, Limit] = {}
     for item in constraints_of(scene):
-        own = [c for c in columns if c == item.name or c.startswith(f"{item.name}_")]
-        limits = [float(limit) for limit in np.broadcast_to(item.limit, len(own))]
-        result.update(zip(own, limits, strict=True))
+        key, lower = item.name, item.response.declared.lower
+        own = [column for column in values if column == key or column.startswith(f"{key}_")]
+        for column, limit in zip(own, np.broadcast_to(item.limit, len(own)), strict=True):
+            arm = column[len(key) + 1 :]
+            unit = item.response.unit_of(arm)
+            result[column] = Limit(key, arm, values[column], float(limit), unit, lower)
     return result
 
 

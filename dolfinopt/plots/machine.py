@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, cast
+from typing import TYPE_CHECKING, TypeAlias, cast
 
 import numpy as np
 from matplotlib.lines import Line2D
@@ -17,12 +17,15 @@ from dolfinopt.plots.poses import Poses, body_poses, even_instants, shown_poses
 from dolfinopt.plots.style import GREY, ORANGE, PathLike, decimals, round_number, styled
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
-    from matplotlib.axes import Axes
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     from dolfinopt.dynamics.build import Trajectory
+    from dolfinopt.plots.plane_machine import PlaneStage
+    from dolfinopt.plots.solid_machine import SolidStage
+
+# A figure of a machine, to which paths and poses are added, and taken away between frames.
+Stage: TypeAlias = "PlaneStage | SolidStage"
 
 FRAMES, FILM_SECONDS = 60, 6.0
 PALE = 0.4  # share of its colours that the first pose keeps
@@ -30,45 +33,6 @@ LARGEST_MAGNIFICATION = 100.0  # beyond it a picture shows a deformation that no
 LARGEST_TURN = 0.5  # rad, about what an arm's end turns by when its tip moves a third of its length
 FILM_COLOURS = 128
 DESIRED = "desired path"
-
-
-class Stage(Protocol):
-    """A figure of a machine: paths and poses are added to it, and taken away between frames."""
-
-    figure: Figure
-    axes: Axes
-
-    def flat(self, points: np.ndarray) -> np.ndarray:
-        """Return where points (..., d), m, are in the axes (..., 2)."""
-        ...
-
-    def path(self, points: np.ndarray, colour: str) -> None:
-        """Draw the line through points (n, d), m."""
-        ...
-
-    def pose(self, n: int, strength: float = 1.0) -> None:
-        """Draw the machine at an instant, in a share of its colours, the rest white."""
-        ...
-
-    def keep(self) -> None:
-        """Keep what has been drawn so far in all frames."""
-        ...
-
-    def moving(self) -> list[Artist]:
-        """Return what differs from frame to frame, the lowest first."""
-        ...
-
-    def clear(self) -> None:
-        """Take away what was drawn since."""
-        ...
-
-    def render(self) -> None:
-        """Bring what was drawn into the figure."""
-        ...
-
-    def close(self) -> None:
-        """Free what only drawing needs."""
-        ...
 
 
 def stage(views: Sequence[ArmView], poses: Poses, paths: Sequence[np.ndarray], title: str) -> Stage:

@@ -38,7 +38,7 @@ THIN, BAR, DOT = 1.0, 5.0, 5.0  # points: lines, rigid arms, joints
 
 
 class PlaneStage:
-    """The figure of a plane machine, see `machine.Stage`."""
+    """The figure of a plane machine, see `machine.stage`."""
 
     def __init__(
         self, views: Sequence[ArmView], poses: Poses, paths: Sequence[np.ndarray], title: str

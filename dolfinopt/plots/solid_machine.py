@@ -32,7 +32,7 @@ BARREL = 0.55  # of a cylinder's length
 
 
 class SolidStage:
-    """The figure of a machine in space, see `machine.Stage`."""
+    """The figure of a machine in space, see `machine.stage`."""
 
     def __init__(
         self, views: Sequence[ArmView], poses: Poses, paths: Sequence[np.ndarray], title: str

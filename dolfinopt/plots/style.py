@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -31,7 +32,6 @@ MARKERS = "osD^vPX"
 BLUE, ORANGE, GREY = PALETTE[0], PALETTE[1], "#6e6e6e"
 INITIAL, OPTIMISED = "initial design", "optimised design"
 KNOWN = {OPTIMISED: 0, INITIAL: 1}  # the same in all pictures of all runs
-LOOKS = len(PALETTE) * len(DASHES)
 LONGEST = 60  # characters of a name in a legend
 FEW_POINTS = 40  # of a line, which gets markers
 MILLI = 1e3
@@ -39,36 +39,6 @@ SOLID_FROM = 0.05  # density from which a cell is drawn where void is left open
 
 PathLike = str | os.PathLike[str]
 Box = tuple[np.ndarray, np.ndarray]  # lowest and highest corner
-
-
-def look_numbers(groups: Iterable[Sequence[str]]) -> dict[str, int]:
-    """Return a number for every label: the same wherever it occurs, its own as long as any is left.
-
-    Args:
-        groups: the labels that are seen together in one figure; a figure's labels get different
-            colours where they can.
-    """
-    numbers: dict[str, int] = {}
-    for group in groups:
-        labels = list(dict.fromkeys(group))
-        here = {numbers.get(label, KNOWN.get(label)) for label in labels} - {None}
-        for label in labels:
-            if label in numbers:
-                continue
-            number = KNOWN.get(label)
-            if number is None:
-                number = _free_number(set(numbers.values()) | set(KNOWN.values()), here)
-            numbers[label] = number
-            here.add(number)
-    return numbers
-
-
-def _free_number(taken: set[int], here: set[Any]) -> int:
-    """Return the first number that is not taken, of a colour that is not here if there is one."""
-    free = [n for n in range(LOOKS) if n not in taken]
-    free = free or [n for n in range(LOOKS) if n not in here] or list(range(LOOKS))
-    colours = {n % len(PALETTE) for n in here}
-    return next((n for n in free if n % len(PALETTE) not in colours), free[0])
 
 
 def look(number: int) -> dict[str, Any]:
@@ -82,29 +52,19 @@ def look(number: int) -> dict[str, Any]:
 
 
 def looks(groups: Iterable[Sequence[str]]) -> dict[str, dict[str, Any]]:
-    """Return how the curve of every label looks, see `look_numbers`."""
-    return {label: look(number) for label, number in look_numbers(groups).items()}
+    """Return how the curve of every label looks: the same wherever it occurs.
+
+    Args:
+        groups: the labels that are seen together in one figure; 28 of all are told apart, and
+            seven that follow each other by their colours.
+    """
+    numbers = dict(KNOWN)
+    for label in chain.from_iterable(groups):
+        numbers.setdefault(label, len(numbers))
+    return {label: look(number) for label, number in numbers.items()}
 
 
 # -- names -----------------------------------------------------------------------------------
-
-
-def spread(places: Sequence[float], gap: float, high: float = 1.0) -> np.ndarray:
-    """Return places at least `gap` apart, in the same order, close to the given ones.
-
-    None lies above `high` unless they need more room than there is above zero.
-    """
-    wanted = np.asarray(places, dtype=float)
-    order = np.argsort(wanted, kind="stable")
-    found = wanted[order]
-    for k in range(1, len(found)):
-        found[k] = max(found[k], found[k - 1] + gap)
-    high = max(high, gap * (len(found) - 1))
-    for k in range(len(found) - 1, -1, -1):
-        found[k] = min(found[k], high - gap * (len(found) - 1 - k))
-    result = np.empty_like(found)
-    result[order] = found
-    return result
 
 
 def shortened(name: str) -> str:

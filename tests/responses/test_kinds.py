@@ -11,7 +11,7 @@ from runs import demo, refused, scene
 import dolfinopt as do
 from dolfinopt import Model
 from dolfinopt.motion.build import rests
-from dolfinopt.plots.curves import constraint_label, deviation_limits, limits_by_column
+from dolfinopt.plots.curves import deviation_limits, limits_by_column
 from dolfinopt.responses.constraints import limits_of
 from dolfinopt.responses.response import find
 from dolfinopt.scene.laws import Limits, law_for
@@ -76,8 +76,7 @@ def test_peak_forces_are_limited_drive_by_drive():
     assert [one.name for one in found] == [f"peak_force_{k}" for k in ("cart", "arm1", "arm2")]
     assert [one.unit for one in found] == ["N", "N m", "N m"]
     assert [one.limit for one in found] == [20.0, 30.0, 10.0]
-    assert constraint_label("peak_force_cart") == "peak force of cart [N]"
-    assert constraint_label("peak_force_arm2") == "peak force of arm2 [N m]"
+    assert [one.words for one in found][::2] == ["peak force of cart", "peak force of arm2"]
     # As the optimiser has them, the true ones over their limits.
     relative = [one.value / one.limit - 1.0 for one in found]
     assert result.evaluation.constraints[-3:] == pytest.approx(relative, rel=1e-12)
@@ -95,7 +94,7 @@ def test_a_drive_may_have_no_limit():
     (found,) = limits_of(made, result.evaluation)[-1:]
     assert (found.name, found.limit) == ("peak_force_arm1", 30.0)
     assert len(result.evaluation.constraints) == 3  # with the volumes of both arms
-    assert limits_by_column(made, ["peak_force_arm1"]) == {"peak_force_arm1": 30.0}
+    assert limits_by_column(made, {found.name: found.value}) == {found.name: found}
     text = json.dumps(made.to_dict(), allow_nan=False)
     assert do.scene_from_dict(json.loads(text)) == made
 
