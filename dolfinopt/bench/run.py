@@ -26,7 +26,7 @@ Measured by `dolfinopt bench{}`: CPU seconds of this process, the least of the r
 thread, unless a table says otherwise."""
 # The main one first; what takes long, or is about designs, only when it is named.
 DIAGRAMS = accuracy.MOTION, iterations.ITERATION, accuracy.ELEMENTS, accuracy.TOLERANCE
-NAMED = iterations.OPTIMISER, solid.SOLID, solid.STATICS
+NAMED = iterations.OPTIMISER, solid.SOLID
 
 
 def named(names: Sequence[str]) -> tuple[Diagram, ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,67 +94,51 @@ def gather_views(
         x_filtered: what the designs were projected from, if it is known; on all ranks or none.
     """
 
-    def collect(values: Any) -> dict[int, np.ndarray]:
-        with together(partition.world):
-            mine = {index: values(index, arm) for index, arm in arms.items()}
-        return gather_cells(partition, mine)
-
-    def corner_nodes(arm: Arm) -> np.ndarray:
+    def of_arm(index: int, arm: Arm) -> dict[str, np.ndarray]:
         operators = arm.substructure.operators  # also of arms that no design was set for
-        return operators.cells[:, : compat.cell_corner_count(arm.mesh.mesh)]
+        nodes = operators.cells[:, : compat.cell_corner_count(arm.mesh.mesh)]
+        shape = (*nodes.shape, arm.mesh.dim, 0)
+        own = {
+            "centroid": arm.mesh.centroid,
+            "density": x_phys[index],
+            "corners": arm.kind.points(x_phys[index])[nodes],
+            "modes": np.zeros(shape) if arm.basis is None else arm.basis.V[nodes],
+        }
+        return own if x_filtered is None else own | {"filtered": x_filtered[index]}
 
-    def modes(index: int, arm: Arm) -> np.ndarray:
-        cells = corner_nodes(arm)
-        if arm.basis is None:
-            return np.zeros((*cells.shape, arm.mesh.dim, 0))
-        return arm.basis.V[cells]
-
-    def points(index: int, arm: Arm) -> np.ndarray:
-        return arm.kind.points(x_phys[index])[corner_nodes(arm)]
-
-    corners = collect(points)
-    centroids = collect(lambda _, arm: arm.mesh.centroid)
-    densities = collect(lambda index, _: x_phys[index])
-    smooth = collect(lambda index, _: x_filtered[index]) if x_filtered is not None else {}
-    shapes = collect(modes)
+    with together(partition.world):
+        mine = {index: of_arm(index, arm) for index, arm in arms.items()}
+    names = ["centroid", "density", "corners", "modes", *["filtered"] * (x_filtered is not None)]
+    cells = {name: gather_cells(partition, {k: x[name] for k, x in mine.items()}) for name in names}
     with together(partition.world):
         if partition.world.rank == 0:
-            return _views(scene, corners, centroids, densities, smooth, shapes, stress or {})
+            return _views(scene, cells, stress or {})
         return []
 
 
 def _views(
-    scene: Scene,
-    corners: Mapping[int, np.ndarray],
-    centroids: Mapping[int, np.ndarray],
-    densities: Mapping[int, np.ndarray],
-    smooth: Mapping[int, np.ndarray],
-    shapes: Mapping[int, np.ndarray],
-    stress: Mapping[int, ArmStress],
+    scene: Scene, cells: Mapping[str, Mapping[int, np.ndarray]], stress: Mapping[int, ArmStress]
 ) -> list[ArmView]:
-    """Return the views of all arms in the chain, given those with a design (root only)."""
+    """Return the views of all arms in the chain, given cells of those with a design (root only)."""
     views = []
     for index, owner in enumerate(scene.owners):
-        name = scene.arms[index].name
+        keys = scene.arms[index]
         if owner is None:
-            views.append(_undesigned_view(scene.arms[index], scene.dimension))
+            views.append(_undesigned_view(keys, scene.dimension))
             continue
-        order = canonical_order(centroids[owner])
-        around = TENSOR[corners[owner].shape[1:]]
-        known = stress.get(index)
+        order = canonical_order(cells["centroid"][owner])
+        own = {name: by_arm[owner][order] for name, by_arm in cells.items()}
+        around, known = TENSOR[own["corners"].shape[1:]], stress.get(index)
+        own |= {name: own[name][:, around] for name in ("corners", "modes")}
         views.append(
             ArmView(
-                name,
-                corners[owner][order][:, around],
-                centroids[owner][order],
-                densities[owner][order],
-                shapes[owner][order][:, around],
-                length=scene.arms[index].length,
+                name=keys.name,
+                **own,
+                length=keys.length,
                 regions=_outlines(scene, index),
                 stress=None if known is None else known.by_cell[order],
                 stress_instant=None if known is None else known.when[order],
-                filtered=smooth[owner][order] if owner in smooth else None,
-                wall=scene.arms[owner].wall_at(densities[owner][order]),
+                wall=scene.arms[owner].wall_at(own["density"]),
             )
         )
     return views
@@ -336,16 +320,14 @@ def read_smooth_design(
 
 def _repeat(arm: ArmKeys, pattern: ArmKeys, arrays: dict[str, np.ndarray]) -> None:
     """Add an arm that repeats another's design to the arrays of a file that has the latter."""
-    centroid, density = (f"{pattern.name}/{key}" for key in ("centroid", "density"))
-    filtered = f"{pattern.name}/filtered"
-    points = arrays.get(centroid, np.empty(0))
-    if f"{arm.name}/density" in arrays or density not in arrays or points.ndim != 2:
+    if f"{arm.name}/density" in arrays:
         return
-    scale = [arm.length / pattern.length, arm.height / pattern.height]
-    arrays[f"{arm.name}/centroid"] = points[:, :2] * scale
-    arrays[f"{arm.name}/density"] = arrays[density]
-    if filtered in arrays:
-        arrays[f"{arm.name}/filtered"] = arrays[filtered]
+    for key in ("centroid", "density", "filtered"):
+        values = arrays.get(f"{pattern.name}/{key}")
+        if values is not None and values.ndim == 2:
+            values = values[:, :2] * [arm.length / pattern.length, arm.height / pattern.height]
+        if values is not None:
+            arrays[f"{arm.name}/{key}"] = values
 
 
 def _load_design(path: Path) -> dict[str, np.ndarray]:
@@ -377,57 +359,51 @@ def _fit(
     path: Path, scene: Scene, index: int, mesh: ArmMesh, arrays: dict[str, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the file's densities, and the filtered ones if any, of a mesh by nearest centroid."""
-    from scipy.spatial import cKDTree
-
     if index in scene.patterns:
         _repeat(scene.arms[index], scene.arms[scene.patterns[index]], arrays)
-    name = mesh.name
-    keys = (f"{name}/centroid", f"{name}/density")
-    missing = [key for key in keys if key not in arrays]
-    if missing:
-        result = sorted({key.split("/")[0] for key in arrays if "/" in key})
+    keys = [f"{mesh.name}/{key}" for key in ("centroid", "density", "filtered")]
+    for key in keys[:2]:
+        if key not in arrays:
+            names = sorted({key.split("/")[0] for key in arrays if "/" in key})
+            raise InputError(
+                f"{path}: missing key {key!r} for arm {mesh.name!r}; the file holds "
+                f"{', '.join(map(repr, names)) or 'nothing'}; give a design made for these arms"
+            )
+    centroid, density, filtered = arrays[keys[0]], arrays[keys[1]], arrays.get(keys[2])
+    shape, fits = density.shape, centroid.ndim == 2 and centroid.shape[1] >= mesh.dim
+    if len(shape) != 1 or not fits or centroid.shape[:1] != shape:
         raise InputError(
-            f"{path}: missing key {missing[0]!r} for arm {name!r}; the file holds "
-            f"{', '.join(map(repr, result)) or 'nothing'}; give a design made for these arms"
+            f"{path}: {keys[1]} has shape {shape} beside centroids of shape {centroid.shape}; "
+            f"expected (n,) and (n, {mesh.dim})"
         )
-    centroid, density = (np.asarray(arrays[key]) for key in keys)
-    if centroid.ndim != 2 or centroid.shape[1] < mesh.dim or density.shape != centroid.shape[:1]:
-        raise InputError(
-            f"{path}: {keys[1]} has shape {density.shape} beside centroids of shape "
-            f"{centroid.shape}; expected (n,) and (n, {mesh.dim})"
-        )
-    if centroid.dtype.kind not in "fiu":
-        raise InputError(f"{path}: {keys[0]} holds {centroid.dtype}, not real numbers")
-    centroid = centroid.astype(float)[:, : mesh.dim]
-    if len(density) == 0 or not np.isfinite(centroid).all():
-        raise InputError(f"{path}: {keys[0]} is empty or not finite; give a complete design")
+    for key, values in zip(keys[::2], (centroid, filtered), strict=True):
+        if values is not None and (values.shape[:1] != shape or not _are_numbers(values)):
+            raise InputError(
+                f"{path}: {key}: expected finite numbers for {len(density)} cells; give a complete "
+                "design"
+            )
     density = physical(f"{path}: {keys[1]}", density)
-    place = _nearest(path, mesh, centroid, cKDTree)
-    filtered = arrays.get(f"{name}/filtered")
-    if filtered is None:
-        return density[place], None
-    finite = filtered.dtype.kind in "fiu" and bool(np.isfinite(filtered).all())
-    if filtered.shape != density.shape or not finite:
-        raise InputError(
-            f"{path}: '{name}/filtered' has shape {filtered.shape}: expected {len(density)} finite "
-            "numbers, one a cell"
-        )
-    return density[place], filtered.astype(float)[place]
+    place = _nearest(path, mesh, centroid[:, : mesh.dim].astype(float))
+    return density[place], None if filtered is None else filtered.astype(float)[place]
 
 
-def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray, tree: Any) -> np.ndarray:
+def _are_numbers(values: np.ndarray) -> bool:
+    return bool(len(values) and values.dtype.kind in "fiu" and np.isfinite(values).all())
+
+
+def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray) -> np.ndarray:
     """Return the nearest design point of each cell; both must cover the same region."""
+    from scipy.spatial import cKDTree
+
     cells, comm = mesh.centroid, mesh.comm
     low = np.min(comm.allgather(cells.min(axis=0)), axis=0)
     high = np.max(comm.allgather(cells.max(axis=0)), axis=0)
     size = comm.allreduce(mesh.area.max(), op=max) ** (1.0 / mesh.dim)
-    points = tree(centroid)
-    spacing = points.query(centroid, k=2)[0][:, 1].max() if len(centroid) > 1 else np.inf
-    reach = 2.0 * (size + min(spacing, np.ptp(centroid, axis=0).max()))
-    edge = np.concatenate([centroid.min(axis=0) - low, centroid.max(axis=0) - high])
+    points, a, b = cKDTree(centroid), centroid.min(axis=0), centroid.max(axis=0)
+    spacing = points.query(centroid, k=2)[0][:, 1].max()  # inf of a single point
+    reach = 2.0 * (size + min(spacing, (b - a).max()))
     distance, place = points.query(cells)
-    if np.abs(edge).max() > reach or distance.max() > reach:
-        a, b = centroid.min(axis=0), centroid.max(axis=0)
+    if max(np.abs(a - low).max(), np.abs(b - high).max(), distance.max()) > reach:
         raise InputError(
             f"{path}: the design of arm {mesh.name!r} covers {_box(a, b)}, "
             f"its mesh {_box(low, high)}; give a design made for these arms"
@@ -519,30 +495,24 @@ def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # -- history.csv: a line an iteration, written as it happens and read back -----------------------
 
 
-class HistoryWriter:
-    """history.csv, a line an iteration as it happens."""
+def write_history(path: Path, rows: Sequence[HistoryRow]) -> None:
+    """Begin the file anew with the rows known so far."""
+    write_text(path, _lines(rows, headed=True) if rows else "")
 
-    def __init__(self, path: Path, rows: Sequence[HistoryRow]):
-        """Begin the file anew with the rows known so far."""
-        self.path = path
-        self.begun = bool(rows)
-        write_text(path, _csv_lines(rows[0].columns, [row.values for row in rows]) if rows else "")
 
-    def append(self, row: HistoryRow) -> None:
-        """Add one line; the first row brings the header, too."""
-        line = _csv_lines([] if self.begun else row.columns, [row.values]).lstrip("\n")
-        self.begun = True
-        append_text(self.path, line)
+def append_history(path: Path, row: HistoryRow) -> None:
+    """Add one line; the first row brings the header, too."""
+    append_text(path, _lines([row], headed=path.stat().st_size == 0))
+
+
+def _lines(rows: Sequence[HistoryRow], headed: bool) -> str:
+    lines = [rows[0].columns] * headed
+    lines += [[f"{value:.10g}" for value in row.values] for row in rows]
+    return "".join(",".join(line) + "\n" for line in lines)
 
 
 def read_history(path: Path) -> list[HistoryRow]:
     """Read history.csv back."""
     with open_input(path) as stream:
-        rows = list(csv.reader(stream.read().decode().splitlines()))
-        return [HistoryRow.from_values(rows[0], list(map(float, row))) for row in rows[1:]]
-
-
-def _csv_lines(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    lines = [",".join(header)]
-    lines += [",".join(str(v) if isinstance(v, int) else f"{v:.10g}" for v in row) for row in rows]
-    return "\n".join(lines) + "\n"
+        header, *rows = csv.reader(stream.read().decode().splitlines())
+        return [HistoryRow.from_values(header, list(map(float, row))) for row in rows]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,14 @@ from dolfinopt.optimization.loop import Report
 from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
-from dolfinopt.output.design import ArmView, HistoryWriter, gather_views, write_design, write_fields
+from dolfinopt.output.design import (
+    ArmView,
+    append_history,
+    gather_views,
+    write_design,
+    write_fields,
+    write_history,
+)
 from dolfinopt.output.feed_forward import write_feed_forward
 from dolfinopt.output.folders import (
     RUN_FILES,
@@ -70,20 +78,21 @@ def write_result(
         pictures: called with the arms' views before the summary is written, on the root.
     """
     begun = time.perf_counter() - wall
-    one = result
-    stress = stress_report(one.partition, one.arms, one.trajectory, one.profile)
-    views = gather_views(one.scene, one.partition, one.arms, one.x_phys, stress, one.x_filtered)
-    summary = summarise(one, wall, stress)
-    with together(one.partition.world):
-        if one.trajectory is None:
+    stress = stress_report(result.partition, result.arms, result.trajectory, result.profile)
+    views = gather_views(
+        result.scene, result.partition, result.arms, result.x_phys, stress, result.x_filtered
+    )
+    summary = summarise(result, wall, stress)
+    with together(result.partition.world):
+        if result.trajectory is None:
             return None
-        write_design(folder, views, one.scene)
+        write_design(folder, views, result.scene)
         if removed := remove_stale_parts(folder):
             summary["warnings"].append(removed)
         if paraview:
             write_fields(folder, views)
-        write_trajectory(folder, one.trajectory, one.initial_deviation)
-        write_feed_forward(folder, one.trajectory)
+        write_trajectory(folder, result.trajectory, result.initial_deviation)
+        write_feed_forward(folder, result.trajectory)
         write_budget(folder, summary["deflection_budget"])
         if pictures is not None:
             since = time.perf_counter()
@@ -106,18 +115,17 @@ class FolderRecorder:
     def __init__(self, folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
         """Take the folder, which exists, and what the checkpoint describes."""
         self.folder, self.scene, self.partition, self.arms = folder, scene, partition, arms
-        self._writer: HistoryWriter | None = None
+        self.history = folder / "history.csv"
 
     def begin(self, rows: Sequence[HistoryRow]) -> None:
         """Write the history anew with the rows known so far (collective)."""
         with together(self.partition.world):
             if self.partition.world.rank == 0:
-                self._writer = HistoryWriter(self.folder / "history.csv", rows)
+                write_history(self.history, rows)
 
     def append(self, row: HistoryRow) -> None:
         """Add a line to the history (root only)."""
-        if self._writer is not None:
-            self._writer.append(row)
+        append_history(self.history, row)
 
     def save(self, memory: Memory) -> None:
         """Replace the checkpoint (collective)."""
@@ -160,53 +168,36 @@ def optimize(
     if resume and overwrite:
         raise InputError("resume, overwrite: expected only one of them")
     scene.check_designed()
-    if folder is None:
-        return _optimize(scene, None, False, False, world, report, built, compared, x0)
-    on_root(world, check_sources, folder, RUN_FILES, scene)
-    check = None if resume or overwrite else partial(check_unused, folder, resume=checkpoint.NAME)
-    with working_alone(world, folder, check):
-        return _optimize(scene, folder, resume, overwrite, world, report, built, compared, x0)
+    with ExitStack() as stack:
+        if folder is not None:
+            on_root(world, check_sources, folder, RUN_FILES, scene)
+            anew = not (resume or overwrite)
+            check = partial(check_unused, folder, resume=checkpoint.NAME) if anew else None
+            stack.enter_context(working_alone(world, folder, check))
+            if anew:
+                on_root(world, checkpoint.begin, folder, scene)
+        # Only now: a run killed while DOLFINx is imported can be resumed like any other.
+        from dolfinopt.arms.arm import build_arms
 
-
-def _optimize(
-    scene: Scene,
-    folder: Path | None,
-    resume: bool,
-    overwrite: bool,
-    world: MPI.Comm,
-    report: Report | None,
-    built: tuple[Partition, dict[int, Arm]] | None,
-    compared: bool,
-    x0: Mapping[int, np.ndarray] | None,
-) -> RankResult:
-    """Optimise in a folder that no other run works in."""
-    if folder is not None and not (resume or overwrite):
-        on_root(world, checkpoint.begin, folder, scene)
-    # Only now, so that a run killed while DOLFINx is imported can be resumed like any other.
-    from dolfinopt.arms.arm import build_arms
-
-    profile = Profile()
-    if built is None:
-        partition = partition_arms(world, scene.cell_counts, whole=scene.dimension == 2)
-        built = partition, build_arms(scene, partition, profile)
-    partition, arms = built
-    if folder is not None and overwrite:  # not before: a mesh that fails leaves the old results
-        on_root(world, checkpoint.begin, folder, scene)
-    memory, recorder = None, None
-    if resume:
-        assert folder is not None
-        memory = checkpoint.load(folder, scene, partition, arms)
-        on_root(world, checkpoint.reopen, folder)
-    if folder is not None:
-        recorder = FolderRecorder(folder, scene, partition, arms)
-    return loop.run(
-        scene,
-        partition,
-        arms,
-        profile,
-        memory=memory,
-        recorder=recorder,
-        report=report,
-        compared=compared,
-        x0=x0,
-    )
+        profile = Profile()
+        if built is None:
+            partition = partition_arms(world, scene.cell_counts, whole=scene.dimension == 2)
+            built = partition, build_arms(scene, partition, profile)
+        memory, recorder = None, None
+        if folder is not None:
+            if overwrite:  # not before: a mesh that fails leaves the old results
+                on_root(world, checkpoint.begin, folder, scene)
+            if resume:
+                memory = checkpoint.load(folder, scene, *built)
+                on_root(world, checkpoint.reopen, folder)
+            recorder = FolderRecorder(folder, scene, *built)
+        return loop.run(
+            scene,
+            *built,
+            profile,
+            memory=memory,
+            recorder=recorder,
+            report=report,
+            compared=compared,
+            x0=x0,
+        )

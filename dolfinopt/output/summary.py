@@ -33,7 +33,7 @@ from dolfinopt.output.trajectory import (
     trajectory_units,
 )
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
-from dolfinopt.profiling import Counts, Profile
+from dolfinopt.profiling import Counts
 from dolfinopt.responses.constraints import limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
 from dolfinopt.responses.order_selection import OrderSelection
@@ -122,6 +122,7 @@ def summarise(
     scene, partition = run.scene, run.partition
     cost = _cost(run, wall)  # without what follows
     traits, beside = _gather_traits(run), machines_beside(run)
+    stiffening = stiffening_of(run.arms)
     with together(partition.world):
         if partition.world.rank != 0:
             return {}
@@ -141,7 +142,7 @@ def summarise(
             "simulation_error_estimate": run.evaluation.error,
             "integrator": None if run.trajectory is None else _integrator(run.trajectory),
             "reduction": _reduction(scene, run.choice),
-            "stiffening": _stiffening(stiffening_of(run.arms)),
+            "stiffening": None if stiffening is None else asdict(stiffening),
             "warnings": _all_warnings(run, traits),
             "iterations": run.iterations,
             "best_iteration": run.best_iteration,
@@ -194,30 +195,24 @@ class _Traits:
     notes: tuple[str, ...]  # of the mesh
     contacts: Contacts  # how the design cut at one half hangs together
     widths: Widths = (None, None)  # of member and gap of the design cut at one half
-    # first one of the arm by itself, Hz; None where it is not reduced
+    # first frequency of the arm by itself, Hz, and by how much that of the reduced model exceeds
+    # it, relative; None where it is not reduced
     frequency: float | None = None
-    error: float | None = None  # by how much that of the reduced model exceeds it, relative
+    error: float | None = None
 
 
 def _gather_traits(run: RankResult) -> dict[int, _Traits]:
     """Return the traits of every design, on the root (collective)."""
-    partition, arms, x_phys = run.partition, run.arms, run.x_phys
+    partition, arms, x_phys, counts = run.partition, run.arms, run.x_phys, run.profile.counts
+    run.profile.counts = replace(counts)  # nothing of the result depends on what follows
     with together(partition.world):
         mine = {k: _traits(run.scene, k, arm, x_phys[k]) for k, arm in arms.items()}
-    every = gather_arms(partition, mine)
-    grey = partition.world.bcast(is_grey(run.scene, _grayness(every)), root=0)
-    widths = {} if grey else _widths(partition, arms, x_phys)
-    frequencies = _frequencies(partition, arms, x_phys, run.profile)
-    with together(partition.world):
-        return {
-            k: replace(
-                item,
-                widths=widths.get(k, (None, None)),
-                frequency=frequencies.get(k, (None, None))[0],
-                error=frequencies.get(k, (None, None))[1],
-            )
-            for k, item in every.items()
-        }
+    run.profile.counts = counts
+    traits = gather_arms(partition, mine)
+    if partition.world.bcast(is_grey(run.scene, _grayness(traits)), root=0):
+        return traits
+    widths = _widths(partition, arms, x_phys)
+    return {k: replace(item, widths=widths.get(k, item.widths)) for k, item in traits.items()}
 
 
 def _of_designs(run: RankResult, traits: Mapping[int, _Traits]) -> dict[str, Any]:
@@ -302,15 +297,15 @@ def _too_narrow(run: RankResult, traits: Mapping[int, _Traits]) -> list[_Narrow]
     ]
 
 
-def _contacts(found: Contacts) -> dict[str, Any]:
+def _contacts(contacts: Contacts) -> dict[str, Any]:
     """Return the entry of an arm's contacts."""
     return {
-        "pieces": found.pieces,
-        "corners": found.corners,
-        "edges": found.edges,
-        "places": found.places.tolist(),
-        "left_out": found.left_out,
-        "remaining": found.remaining,
+        "pieces": contacts.pieces,
+        "corners": contacts.corners,
+        "edges": contacts.edges,
+        "places": contacts.places.tolist(),
+        "left_out": contacts.left_out,
+        "remaining": contacts.remaining,
     }
 
 
@@ -508,25 +503,6 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     return units
 
 
-def _frequencies(
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Mapping[int, np.ndarray],
-    profile: Profile,
-) -> dict[int, tuple[float, float]]:
-    """Return every reduced design's first frequency, Hz, and the reduced model's excess."""
-    # On the root (collective). It is not counted: nothing depends on it.
-    counts, result = replace(profile.counts), {}
-    with together(partition.world):
-        for index, arm in arms.items():
-            if arm.basis is not None:
-                state = arm.state(x_phys[index])
-                own = state.first_frequency
-                result[index] = own, max(0.0, state.body.first_frequency / own - 1.0)
-    profile.counts = counts
-    return gather_arms(partition, result)
-
-
 def _widths(
     partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> dict[int, Widths]:
@@ -559,7 +535,7 @@ def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:
 
 def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
     """Return what needs the design's own cells alone (collective on its ranks)."""
-    return _Traits(
+    traits = _Traits(
         arm.volume_fraction(x_phys),
         arm.grayness(x_phys),
         (scene.arms[index].cells and scene.arms[index].cell_size) or arm.mesh.cell_size,
@@ -567,6 +543,12 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         tuple(arm.mesh.notes),
         arm.contacts(arm.kind.share(x_phys) > SOLID),
     )
+    if arm.basis is None:
+        return traits
+    state = arm.state(x_phys)
+    frequency = state.first_frequency
+    error = max(0.0, state.body.first_frequency / frequency - 1.0)
+    return replace(traits, frequency=frequency, error=error)
 
 
 def is_grey(scene: Scene, grayness: float) -> bool:
@@ -655,14 +637,11 @@ def _reduction(scene: Scene, choice: OrderSelection | None) -> dict[str, Any]:
     # For a given number there is no estimate: it would cost a simulation with more coordinates.
     if choice is None:
         return {"coordinates": scene.reduction.coordinates, "error_estimate": None, "tried": []}
-    return {
-        "coordinates": choice.coordinates,
-        "error_estimate": _finite(choice.error),
-        "tried": [
-            {"coordinates": count, "error_estimate": _finite(error)}
-            for count, error in choice.tried
-        ],
-    }
+    rows = [
+        {"coordinates": count, "error_estimate": _finite(error)}
+        for count, error in ((choice.coordinates, choice.error), *choice.tried)
+    ]
+    return {**rows[0], "tried": rows[1:]}
 
 
 def _finite(value: float) -> float | None:
@@ -679,11 +658,6 @@ def _too_few(scene: Scene, choice: OrderSelection | None) -> list[str]:
         f"{scene.reduction.tolerance:g}; optimise with reduction.coordinates = "
         f"{2 * choice.coordinates}, or a smaller tolerance"
     ]
-
-
-def _stiffening(stiffening: Stiffening | None) -> dict[str, Any] | None:
-    """Return whether the loads' geometric stiffness was taken into account, and how large it is."""
-    return None if stiffening is None else asdict(stiffening)
 
 
 def _unstiffened(stiffening: Stiffening | None) -> list[str]:

@@ -17,19 +17,17 @@ import numpy as np
 import pandas as pd
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import chain_of
+from dolfinopt.arms.arm import Arm, chain_of
 from dolfinopt.disk import make_folder, write_text
 from dolfinopt.dynamics.build import build_system, desired_motion
-from dolfinopt.errors import InputError
 from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.output.feed_forward import finer_deviation, simulated_with, with_feed_forward
-from dolfinopt.parallel import on_root, together
+from dolfinopt.parallel import Partition, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.cases import Case, Outcome, Runner
-from dolfinopt.study.studies import DEVIATION, Design, deviation_panels, given_designs
+from dolfinopt.study.studies import DEVIATION, deviation_panels, single_design
 from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "motions"  # of the study's files, and of the folder of the shaped joints
@@ -44,6 +42,10 @@ SHAPERS: dict[ShaperKind, str] = {
 KEPT = ("base", "cart_mass", "joint_height", "gravity", "initial_joints")
 ROWS = 2000  # of a table of shaped joints
 TEN_PERCENT, FIVE_PERCENT = 1.1, 0.95
+
+Place = tuple[
+    Partition, dict[int, Arm], dict[int, np.ndarray]
+]  # of a design, see `arms_with_design`
 
 
 class Motion(NamedTuple):
@@ -72,7 +74,9 @@ def study_motions(scene: Scene, designs: Sequence[Path], runner: Runner) -> Stud
     Raises:
         InputError: the scene's motion cannot be corrected or shaped; nothing was computed.
     """
-    design = on_root(runner.world, _design, scene, designs)
+    _, design = on_root(runner.world, single_design, scene, designs, NAME)
+    with together(runner.world):
+        with_feed_forward(scene, "tip")  # refused where the motion cannot be corrected
     files = [design]
     if isinstance(design, Case):
         searched = [design, Case(with_feed_forward(scene, "tip"), "optimize", label=DESIGNED)]
@@ -90,14 +94,6 @@ def study_motions(scene: Scene, designs: Sequence[Path], runner: Runner) -> Stud
     return Study(NAME, (table,), (figure,), failed, runner.computed)
 
 
-def _design(scene: Scene, designs: Sequence[Path]) -> Design:
-    """Return the arms' design; raise InputError where the motion has no feed-forward."""
-    if len(designs) > 1:
-        raise InputError(f"--design: expected one file with compare motions, found {len(designs)}")
-    with_feed_forward(scene, "tip")
-    return [*given_designs(scene, designs).values()][-1]
-
-
 def machines(scene: Scene) -> dict[str, str]:
     """Return what differs in the machines that motions do not know, by their names."""
     material, damping = scene.material, scene.damping.stiffness_proportional
@@ -113,21 +109,23 @@ def machines(scene: Scene) -> dict[str, str]:
 
 def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list[Motion]:
     """Return the motions with the first design, and feed-forward with the second (root only)."""
-    first, *second = designs
-    rigid, forward = (
-        _judged(with_feed_forward(scene, "none")),
-        _judged(with_feed_forward(scene, "tip")),
-    )
-    motions = [Motion(Case(rigid, "simulate", first, RIGID), finer=_finer_deviation(rigid, first))]
-    frequency, damping_ratio = build_system(rigid, _bodies(rigid, first)).slowest_vibration(2)
+    rigid, forward = (_judged(with_feed_forward(scene, kind)) for kind in ("none", "tip"))
+    first = designs[0]
+    place = arms_with_design(MPI.COMM_SELF, rigid, first, Profile())
+    finer = _finer_deviation(rigid, place)
+    motions = [Motion(Case(rigid, "simulate", first, RIGID), finer=finer)]
+    _, arms, x_phys = place
+    bodies = chain_of(rigid, {index: arm.reduce(x_phys[index]) for index, arm in arms.items()})
+    frequency, damping_ratio = build_system(rigid, bodies).slowest_vibration(2)
     if frequency > 0.0 and scene.motion.table_ends == "rest":
         for kind, label in SHAPERS.items():
             shaper = input_shaper(kind, frequency, damping_ratio)
             shaped = write_shaped(rigid, shaper, folder / f"{kind}.csv")
             motions.append(Motion(Case(shaped, "simulate", first, label), shaper.longer))
-    for label, design in zip((FORWARD, DESIGNED), (first, *second), strict=False):
+    for label, design in zip((FORWARD, DESIGNED), designs, strict=False):
+        place = arms_with_design(MPI.COMM_SELF, forward, design, Profile())
         case = Case(forward, "simulate", design, label)
-        motions.append(Motion(case, 2.0 * forward.lead, _finer_deviation(forward, design)))
+        motions.append(Motion(case, 2.0 * forward.lead, _finer_deviation(forward, place)))
     return motions
 
 
@@ -138,24 +136,17 @@ def _judged(scene: Scene) -> Scene:
     return scene_from_dict(data, scene.source)
 
 
-def _finer_deviation(scene: Scene, design: Path | None) -> float | None:
+def _finer_deviation(scene: Scene, place: Place) -> float | None:
     """Return the largest deviation in a finer model with this one's corrections, m."""
-    place = arms_with_design(MPI.COMM_SELF, scene, design, Profile())
     if isinstance(scene.reduction.coordinates, str):
         return None
-    held = None
+    corrections = None
     if scene.feed_forward.on:
         nominal = simulated_with(scene, *place)
         if nominal is None:
             return None
-        held = nominal.feed_forward
-    return finer_deviation(scene, *place, held)
-
-
-def _bodies(scene: Scene, design: Path | None) -> list[ShapeIntegrals]:
-    """Return the reduced arms of a design, from the base outwards (this rank alone)."""
-    _, arms, x_phys = arms_with_design(MPI.COMM_SELF, scene, design, Profile())
-    return chain_of(scene, {index: arm.reduce(x_phys[index]) for index, arm in arms.items()})
+        corrections = nominal.feed_forward
+    return finer_deviation(scene, *place, corrections)
 
 
 def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:

@@ -40,8 +40,8 @@ from dolfinopt.study.studies import (
     DEVIATION,
     Design,
     deviation_panels,
-    given_designs,
     results_of,
+    single_design,
 )
 from dolfinopt.study.tables import LineFigure, Study, Table
 
@@ -451,9 +451,7 @@ def _reached(scene: Scene, members: Members, found: Outcome) -> str:
 def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
     """Return the design and its label; raise InputError where no member can take an arm's place."""
     _check_replaceable(scene)
-    if len(designs) > 1:
-        raise InputError(f"--design: expected one file with compare sections, found {len(designs)}")
-    return [*given_designs(scene, designs).items()][-1]
+    return single_design(scene, designs, NAME)
 
 
 def _check_replaceable(scene: Scene) -> None:

@@ -210,6 +210,18 @@ def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
     return {"initial design": None, optimised.label: optimised}
 
 
+def single_design(scene: Scene, designs: Sequence[Path], compared: str) -> tuple[str, Design]:
+    """Return the file's design and its label, or else the one to be optimised.
+
+    InputError where there are several files, see also `given_designs`.
+    """
+    if len(designs) > 1:
+        raise InputError(
+            f"--design: expected one file with compare {compared}, found {len(designs)}"
+        )
+    return [*given_designs(scene, designs).items()][-1]
+
+
 # -- parts of reports ------------------------------------------------------------------------
 
 
