@@ -77,13 +77,9 @@ class Case(Table):
         return self
 
 
-def read_cases(folder: Path | None = None) -> tuple[Case, ...]:
-    """Return all cases, in the order of their names; by default of the package's folder.
-
-    InputError where a case file lacks a key or has one that is not known.
-    """
-    files = sorted((folder or benchmark_folder()).glob("*/case.toml"))
-    return tuple(read_case(file) for file in files)
+def read_cases() -> tuple[Case, ...]:
+    """Return all cases of the package's folder, in the order of their names."""
+    return tuple(read_case(file) for file in sorted(benchmark_folder().glob("*/case.toml")))
 
 
 def read_case(file: Path) -> Case:
@@ -239,8 +235,8 @@ def check(case: Case, records: Path | None = None) -> list[Checked]:
     it cannot be simulated; InputError: the records are not those of the case.
     """
     if case.program:
-        found = load_program(case.folder / case.program).values(records)
-        return [_number(case, value, found[value.quantity]) for value in case.values]
+        values = load_program(case.folder / case.program).values(records)
+        return [_number(case, value, values[value.quantity]) for value in case.values]
     asked = any(value.quantity == "stress" for value in case.values)
     model = Model(case.folder / case.scene, *case.overrides, comm=MPI.COMM_SELF)
     result = model.simulate(case.folder / case.design if case.design else None, stress=asked)
@@ -252,22 +248,22 @@ def check(case: Case, records: Path | None = None) -> list[Checked]:
     ]
 
 
-def _number(case: Case, one: Value, value: float) -> Checked:
-    return Checked(case, one, value, one.reference, value / one.reference - 1.0)
+def _number(case: Case, asked: Value, value: float) -> Checked:
+    return Checked(case, asked, value, asked.reference, value / asked.reference - 1.0)
 
 
-def _history(case: Case, one: Value, result: SimulationResult) -> Checked:
-    table = read_table(one.table)
-    known = table["t"] <= one.until
-    expected = np.stack([table[column] for column in one.columns], axis=1)[known]
-    found = HISTORIES[one.quantity](result, table["t"][known])
+def _history(case: Case, asked: Value, result: SimulationResult) -> Checked:
+    table = read_table(asked.table)
+    known = table["t"] <= asked.until
+    expected = np.stack([table[column] for column in asked.columns], axis=1)[known]
+    computed = HISTORIES[asked.quantity](result, table["t"][known])
     value, reference, error = (
-        float(np.linalg.norm(x, axis=1).max()) for x in (found, expected, found - expected)
+        float(np.linalg.norm(x, axis=1).max()) for x in (computed, expected, computed - expected)
     )
-    return Checked(case, one, value, reference, error / reference)
+    return Checked(case, asked, value, reference, error / reference)
 
 
-def table_of(found: Sequence[Checked]) -> pd.DataFrame:
+def table_of(checks: Sequence[Checked]) -> pd.DataFrame:
     """Return a row for every value: computed, reference, difference, limit, verdict."""
     sign = {"near": "", "most": "at most +", "least": "at least -"}
     rows = [
@@ -282,7 +278,7 @@ def table_of(found: Sequence[Checked]) -> pd.DataFrame:
             *(f"{item.difference:.2g}", f"{sign[item.of.way]}{item.of.limit:g}"),
             "met" if item.met else "MISSED",
         )
-        for item in found
+        for item in checks
     ]
     columns = "case value unit computed reference difference limit verdict"
     return pd.DataFrame(rows, columns=columns.split())

@@ -85,15 +85,15 @@ def _iterations(plan: Plan) -> Steps:
             words = []  # until it has converged
         words += ["objective.kind=static"] * (name == STATIC)
         scene = with_cells(plan.scene, cells, *words)
-        found, memory = in_processes(iterate, scene, ranks=2 if name == TWO_RANKS else 1)
-        yield name, cells[0] * cells[1], *found, memory
+        figures, memory = in_processes(iterate, scene, ranks=2 if name == TWO_RANKS else 1)
+        yield name, cells[0] * cells[1], *figures, memory
 
     def theirs(name: str, cells: Cells) -> Rows:
-        one = plain_iteration(plan.scene, cells)
+        iterate = plain_iteration(plan.scene, cells)
         x = np.full(cells[0] * cells[1], plan.scene.design.initial)
-        one(x)  # what is compiled, ordered and allocated once a run
-        found = timed(partial(one, x), max(3, plan.repeats))[:2]
-        yield name, cells[0] * cells[1], *found, *3 * [np.nan]
+        iterate(x)  # what is compiled, ordered and allocated once a run
+        seconds = timed(partial(iterate, x), max(3, plan.repeats))[:2]
+        yield name, cells[0] * cells[1], *seconds, *3 * [np.nan]
 
     for cells in CELLS[: 2 if plan.quick else None]:
         for name in (OURS, *[TWO_RANKS] * bool(mpirun()), STATIC, PLAIN):
@@ -137,7 +137,7 @@ def plain_statics(
     mesh, d, in_plane = arm.mesh, arm.dim, arm.dim == 2
     space = compat.lagrange_space(mesh, 1, components=d)
     cellwise = getattr(fem, "functionspace", fem.FunctionSpace)(mesh, ("DG", 0))
-    density, found = fem.Function(cellwise), fem.Function(space)
+    density, displacement = fem.Function(cellwise), fem.Function(space)
     a, b, w = ufl.TrialFunction(space), ufl.TestFunction(space), ufl.TestFunction(cellwise)
     # In the plane the law stands in the form, as one writes it; that doubles what an iteration
     # takes: quadrature allows for x**3.0 as if x varied in a cell. In space x is E itself.
@@ -152,7 +152,7 @@ def plain_statics(
 
     end = ufl.gt(ufl.SpatialCoordinate(mesh)[0], (1.0 - 1e-9) * arm.outboard_point[0])
     stiffness = compat.compile_form(young * energy(a, b) * ufl.dx)
-    gradient = compat.compile_form(slope * energy(found, found) * w * ufl.dx)
+    gradient = compat.compile_form(slope * energy(displacement, displacement) * w * ufl.dx)
     dofs = fem.locate_dofs_topological(space, d - 1, arm.inboard_facets)
     clamp = fem.dirichletbc(np.zeros(d), dofs, space)
     force = ufl.conditional(end, 1.0 / area, 0.0) * b[1] * ufl.ds
@@ -181,8 +181,8 @@ def plain_statics(
             with_rigid_motions(K, space.tabulate_dof_coordinates()[:owned])
         solver.setOperators(K)
         solver.solve(load, solution)
-        found.x.array[: len(solution.array)] = solution.array
-        found.x.scatter_forward()
+        displacement.x.array[: len(solution.array)] = solution.array
+        displacement.x.scatter_forward()
         slopes = petsc.assemble_vector(gradient).array_r.copy()
         return float(load.dot(solution)), slopes
 
@@ -202,7 +202,7 @@ def problems() -> dict[str, Table]:
     given = machines.pop("problems")
     motion = machines["pick_and_place"]["motion"]
     motion["file"] = str(template_folder() / motion["file"])
-    return {name: machines[one.pop("machine")] | one for name, one in given.items()}
+    return {name: machines[tables.pop("machine")] | tables for name, tables in given.items()}
 
 
 ROD = "lightest rod"
@@ -228,8 +228,8 @@ def optimised(name: str, start: str, iterations: int) -> Rows:
     seconds, _, result = timed(partial(optimize, scene, world=MPI.COMM_SELF))
     excess = max((limit.excess for limit in result.limits), default=0.0)
     asked = result.iterations, result.counts.simulations, result.counts.adjoints
-    found = result.evaluation.objective, excess, result.best_iteration
-    yield name, start, *asked, *found, seconds, result.stop_code.value
+    reached = result.evaluation.objective, excess, result.best_iteration
+    yield name, start, *asked, *reached, seconds, result.stop_code.value
 
 
 def drawn(arm: Arm, kind: str, size: float) -> np.ndarray:
@@ -259,7 +259,7 @@ def drawn_by_hand(name: str, kind: str) -> Rows:
         """Return whether limits are broken, what is minimised, the excess, and the size."""
         x = {k: drawn(arm, kind, size) for k, arm in arms.items()}
         if not scene.design.projection:  # grey at the edges, as what is optimised
-            x = {k: arms[k].physical(one) for k, one in x.items()}
+            x = {k: arms[k].physical(densities) for k, densities in x.items()}
         try:
             result, _ = evaluate(scene, partition, arms, x, Profile(), simulated=False)
         except ConvergenceError:

@@ -87,14 +87,14 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[li
             except ConvergenceError as error:
                 failures.append(f"{diagram.name}, {name}: {error}")
             content = {"stamp": stamp, "rows": kept}
-            write_text(path, json.dumps(content, default=lambda one: one.item()))
+            write_text(path, json.dumps(content, default=lambda number: number.item()))
     return [row for rows in kept.values() for row in rows], failures
 
 
 @cache
-def source(folder: Path = Path(__file__).parents[1]) -> str:
+def source() -> str:
     """Return a digest of this package's Python files, as they are when first asked for."""
-    digest = hashlib.sha256()
+    digest, folder = hashlib.sha256(), Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()

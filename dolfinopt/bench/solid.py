@@ -112,8 +112,9 @@ def _links(plan: Plan) -> Steps:
     def rows(who: str, cells: Cells, ranks: int) -> Rows:
         link = plain_link if who == PLAIN else iterate_link
         static = [True] * (who == STATIC)
-        (dofs, solver, found), memory = in_processes(link, plan.scene, cells, *static, ranks=ranks)
-        for design, seconds in zip(DESIGNS, found):  # plain DOLFINx has no use for a nearby one
+        result, memory = in_processes(link, plan.scene, cells, *static, ranks=ranks)
+        dofs, solver, by_design = result
+        for design, seconds in zip(DESIGNS, by_design):  # of plain DOLFINx the first alone
             yield f"{who}, {design}", ranks, dofs, seconds, memory * 2**20 / 1e9, solver
 
     for ranks, cells in product((1, 2) if mpirun() else (1,), QUICK if plan.quick else CELLS):

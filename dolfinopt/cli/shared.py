@@ -165,7 +165,7 @@ def draw(
         limits_figure,
     )
     from dolfinopt.plots.design import design_figure, stress_figure
-    from dolfinopt.plots.machine import draw_motion, machine_figure
+    from dolfinopt.plots.machine import draw_motion, machine_figure, make_film
     from dolfinopt.plots.style import save
 
     title, bodies = scene.name, trajectory.mechanism.arms
@@ -186,7 +186,7 @@ def draw(
     if scene.motion.coefficients:
         save(law_figure(scene), folder / "law.png")
     if animation:
-        draw_motion(folder / "motion.gif", views, trajectory)
+        draw_motion(folder / "motion.gif", views, make_film(trajectory))
 
 
 def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:

@@ -61,13 +61,13 @@ def machines_beside(run: RankResult) -> Beside | None:
         plain = simulated_with(with_feed_forward(scene, "none"), *place)
         finer = finer_deviation(scene, *place, held)
 
-    def beside() -> Beside:
+    def comparison() -> Beside:
         if plain is None:
             return Beside(None, {}, finer)
         peaks = map(float, plain.drives[0][scene.driven_columns])
         return Beside(plain.max_deviation[0], dict(zip(scene.driven, peaks, strict=True)), finer)
 
-    return on_root(run.partition.world, beside)
+    return on_root(run.partition.world, comparison)
 
 
 def with_feed_forward(scene: Scene, kind: str) -> Scene:
@@ -152,25 +152,26 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
 
 
 def summary_of_feed_forward(
-    scene: Scene, found: FeedForward | None, beside: Beside | None
+    scene: Scene, feed_forward: FeedForward | None, comparison: Beside | None
 ) -> dict[str, Any] | None:
     """Return what summary.json tells of a feed-forward; None without."""
-    if found is None or beside is None:
+    if feed_forward is None or comparison is None:
         return None
     names, units = list(scene.rigid_units), list(scene.rigid_units.values())
-    joints, splines = found.corrections.joints, found.corrections.splines
-    largest = np.abs(found.corrections.at(np.linspace(0.0, scene.horizon, 2001))[0]).max(axis=0)
+    joints, splines = feed_forward.corrections.joints, feed_forward.corrections.splines
+    t = np.linspace(0.0, scene.horizon, 2001)
+    largest = np.abs(feed_forward.corrections.at(t)[0]).max(axis=0)
     return {
         "joints": [names[k] for k in joints],
         "lead": scene.lead,
         "knots": len(splines.knots),
-        "regularity": found.regularity,
-        "deviation_without": beside.deviation,
-        "deviation_left": found.left,
-        "deviation_left_finer": beside.finer,
-        "drive_peak_without": dict(beside.peaks),
+        "regularity": feed_forward.regularity,
+        "deviation_without": comparison.deviation,
+        "deviation_left": feed_forward.left,
+        "deviation_left_finer": comparison.finer,
+        "drive_peak_without": dict(comparison.peaks),
         "corrections": {names[k]: float(x) for k, x in zip(joints, largest, strict=True)},
-        "slowest_unstable_rate": slowest_unstable_rate(found),
+        "slowest_unstable_rate": slowest_unstable_rate(feed_forward),
         "units": {
             "lead": "s",
             "knots": "-",
@@ -185,9 +186,9 @@ def summary_of_feed_forward(
     }
 
 
-def slowest_unstable_rate(found: FeedForward) -> float | None:
+def slowest_unstable_rate(feed_forward: FeedForward) -> float | None:
     """Return that of the internal dynamics, 1/s; None where there is none, or it is not known."""
-    rates = internal_rates(found)
+    rates = internal_rates(feed_forward)
     if rates is None:
         return None
     unstable = rates.real[rates.real > ROUNDING * np.abs(rates)]  # undamped ones are beside zero

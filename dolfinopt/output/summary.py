@@ -121,7 +121,7 @@ def summarise(
     """
     scene, partition = run.scene, run.partition
     cost = _cost(run, wall)  # without what follows
-    traits, beside = _gather_traits(run), machines_beside(run)
+    traits, comparison = _gather_traits(run), machines_beside(run)
     stiffening = stiffening_of(run.arms)
     with together(partition.world):
         if partition.world.rank != 0:
@@ -134,7 +134,7 @@ def summarise(
             "loop_start": loop_start(scene),
             "feed_forward": None
             if run.trajectory is None
-            else summary_of_feed_forward(scene, run.trajectory.feed_forward, beside),
+            else summary_of_feed_forward(scene, run.trajectory.feed_forward, comparison),
             "deflection_budget": budget_of(run.trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, traits),
@@ -475,10 +475,10 @@ def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | N
     """Return the largest stress at element centres, and at Gauss points, too; of every arm."""
     if not stress:
         return None
-    place, one = max(stress.items(), key=lambda item: item[1].peak.value)
+    place, highest = max(stress.items(), key=lambda item: item[1].peak.value)
     at, other = max(stress.items(), key=lambda item: item[1].peak_at_points.value)
     return {
-        **one.peak.to_dict(scene.arms[place].name),
+        **highest.peak.to_dict(scene.arms[place].name),
         "at_gauss_points": other.peak_at_points.to_dict(scene.arms[at].name),
         "by_arm": {scene.arms[k].name: each.peak.value for k, each in stress.items()},
     }
@@ -519,10 +519,10 @@ def _widths(
                 points = _lowest(mesh.comm, points)
             corners[k], solid[k], fixed[k] = points, x_phys[k] > SOLID, mesh.fixed
             asked[k] = max(design.least_widths)
-    whole, cut, stays = (gather_cells(partition, item) for item in (corners, solid, fixed))
+    cells, cut, stays = (gather_cells(partition, item) for item in (corners, solid, fixed))
     asked = gather_arms(partition, asked)
     with together(partition.world):
-        return {k: widths_of(whole[k], cut[k], stays[k], asked[k]) for k in whole}
+        return {k: widths_of(cells[k], cut[k], stays[k], asked[k]) for k in cells}
 
 
 def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:

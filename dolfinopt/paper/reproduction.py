@@ -251,20 +251,20 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     return dict(sorted(figures.items()))
 
 
-def _over_time(title: str, *found: Sequence[Outcome]) -> LineFigure:
+def _over_time(title: str, *groups: Sequence[Outcome]) -> LineFigure:
     """Return deviations over time; empty axes where nothing could be simulated."""
-    panels = [panel for outcomes in found for panel in studies.deviation_panels(outcomes)]
+    panels = [panel for outcomes in groups for panel in studies.deviation_panels(outcomes)]
     return LineFigure("", title, tuple(panels) or (Panel("", "time [s]", "deviation [mm]", ()),))
 
 
-def _convergence(found: Sequence[Outcome]) -> Iterator[LineFigure]:
+def _convergence(outcomes: Sequence[Outcome]) -> Iterator[LineFigure]:
     """Yield objective and grayness of designs against the iteration."""
     for what, key, label in (
         ("compliance", "objective", "objective [N m]"),
         ("grayness", "grayness", "grayness [-]"),
     ):
         lines = []
-        for item in found:
+        for item in outcomes:
             x, y = zip(*((row.iteration, getattr(row, key)) for row in item.history()))
             lines.append(Line(item.case.label, np.array(x), np.array(y)))
         seen = key == "objective"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, cast
@@ -151,7 +151,14 @@ class Film:
 def make_film(
     trajectory: Trajectory, magnification: float | None = None, frames: int = FRAMES
 ) -> Film:
-    """Choose frames evenly from the instants and magnify the deformation; see `draw_motion`."""
+    """Choose frames evenly from the instants and magnify the deformation.
+
+    Args:
+        trajectory: how the machine moves, at even instants.
+        magnification: of the deformation, and of how far joints are off; default a round number
+            from 1 to 100 that shows the largest deviation as about a tenth of the machine's size.
+        frames: number of pictures, at most that of the instants.
+    """
     mechanism, loops, q_e = trajectory.mechanism, trajectory.loops, trajectory.q_e
     ideal, q_r = trajectory.desired.q, trajectory.q_r
     rigid = body_poses(mechanism, ideal, np.zeros_like(q_e), loops)
@@ -193,37 +200,38 @@ def round_magnification(largest: float, size: float, turn: float = 0.0) -> float
 
 
 @styled
-def draw_motion(
-    path: PathLike,
-    views: Sequence[ArmView],
-    trajectory: Trajectory,
-    magnification: float | None = None,
-    frames: int = FRAMES,
-    duration: float = FILM_SECONDS,
-) -> Path:
-    """Draw the moving, deformed machine (animated GIF).
+def draw_motion(path: PathLike, views: Sequence[ArmView], film: Film) -> Path:
+    """Draw the moving, deformed machine as an animated GIF of some seconds; return its path.
 
     Args:
         path: of the picture.
         views: of all arms, reduced, in the mechanism's order.
-        trajectory: how it moves, at even instants.
-        magnification: of the deformation, and of how far joints are off; default a round number
-            from 1 to 100 that shows the largest deviation as about a tenth of the machine's size.
-        frames: number of pictures, at most that of the instants.
-        duration: of the film, s.
-
-    Returns:
-        The path.
+        film: how it moves.
     """
-    film = make_film(trajectory, magnification, frames)
     count = len(film.at)
-    delay = max(20.0, 10.0 * round(100.0 * duration / count))  # ms; GIF counts in 10 ms
-    speed = float(np.ptp(trajectory.t)) / (1e-3 * delay * count)
+    delay = max(20.0, 10.0 * round(100.0 * FILM_SECONDS / count))  # ms; GIF counts in 10 ms
+    speed = float(np.ptp(film.t)) / (1e-3 * delay * count)
     drawn = film_stage(views, film, speed)
     try:
-        return _write(Path(path), Frames(drawn, film), delay)
+        draw = frame_drawer(drawn, film)
+        # A palette of each frame's own would take longer to find than the frame to draw, and would
+        # let the colours flicker.
+        palette = Image.new("P", (1, 1))
+        samples = np.stack([draw(k) for k in (0, count // 2, count - 1)])
+        palette.putpalette(common_colours(samples).tobytes())
+        first, *others = (
+            Image.fromarray(draw(k)).quantize(palette=palette, dither=Image.Dither.NONE)
+            for k in range(count)
+        )
     finally:
         drawn.close()
+    write_atomically(
+        Path(path),
+        lambda stream: first.save(
+            stream, format="GIF", save_all=True, append_images=others, duration=delay, loop=0
+        ),
+    )
+    return Path(path)
 
 
 def film_stage(views: Sequence[ArmView], film: Film, speed: float) -> Stage:
@@ -237,58 +245,29 @@ def film_stage(views: Sequence[ArmView], film: Film, speed: float) -> Stage:
     return drawn
 
 
-class Frames:
-    """The frames of a film: what stands still is drawn once, the rest over it every time."""
+def frame_drawer(drawn: Stage, film: Film) -> Callable[[int], np.ndarray]:
+    """Return the function from a frame's number to its picture (height, width, 3), uint8.
 
-    def __init__(self, drawn: Stage, film: Film) -> None:
-        """Draw what stands still."""
-        self.drawn, self.film = drawn, film
-        self.clock = drawn.axes.set_title("", loc="right")
-        self.canvas = cast("FigureCanvasAgg", drawn.figure.canvas)
-        self.canvas.draw()
-        self.still = self.canvas.copy_from_bbox(drawn.figure.bbox)
+    What stands still is drawn once, the rest over it every time.
+    """
+    clock = drawn.axes.set_title("", loc="right")
+    canvas = cast("FigureCanvasAgg", drawn.figure.canvas)
+    canvas.draw()
+    still = canvas.copy_from_bbox(drawn.figure.bbox)
 
-    def __len__(self) -> int:
-        """Count them."""
-        return len(self.film.at)
-
-    def draw(self, k: int) -> np.ndarray:
-        """Return a frame (height, width, 3), uint8."""
-        drawn, film = self.drawn, self.film
+    def draw(k: int) -> np.ndarray:
         drawn.clear()
         drawn.path(film.rigid.skeleton(k), GREY)
         drawn.path(film.trace[: film.at[k] + 1], ORANGE)
         drawn.pose(k)
         drawn.render()
-        self.clock.set_text(f"t = {film.t[k]:.{decimals(film.t)}f} s")
-        self.canvas.restore_region(self.still)
-        for artist in (*drawn.moving(), self.clock):
+        clock.set_text(f"t = {film.t[k]:.{decimals(film.t)}f} s")
+        canvas.restore_region(still)
+        for artist in (*drawn.moving(), clock):
             drawn.axes.draw_artist(artist)
-        return np.array(self.canvas.buffer_rgba())[:, :, :3]
+        return np.array(canvas.buffer_rgba())[:, :, :3]
 
-
-def _write(path: Path, frames: Frames, delay: float) -> Path:
-    """Write all frames in the same few colours."""
-    # A palette of each frame's own would take longer to find than the frame to draw, and would let
-    # the colours flicker.
-    count = len(frames)
-    palette = Image.new("P", (1, 1))
-    samples = np.stack([frames.draw(k) for k in (0, count // 2, count - 1)])
-    palette.putpalette(common_colours(samples).tobytes())
-
-    def pictures() -> Iterator[Image.Image]:
-        for k in range(count):
-            frame = Image.fromarray(frames.draw(k))
-            yield frame.quantize(palette=palette, dither=Image.Dither.NONE)
-
-    first, *others = pictures()
-    write_atomically(
-        path,
-        lambda stream: first.save(
-            stream, format="GIF", save_all=True, append_images=others, duration=delay, loop=0
-        ),
-    )
-    return path
+    return draw
 
 
 def common_colours(pictures: np.ndarray) -> np.ndarray:

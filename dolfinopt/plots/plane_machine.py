@@ -70,28 +70,38 @@ class PlaneStage:
 
     def pose(self, n: int, strength: float = 1.0) -> None:
         """Draw arms, their supports and joints at an instant."""
-        poses, size, grey = self.poses, self.poses.size, mixed(BASE, strength)
-        joints = []
+        poses = self.poses
         for i, parent in enumerate(poses.parents):
             if parent == GROUND:
                 self._draw_support(poses.held[n, i], not self.stands, strength)
-            joints.append(poses.origin[n, i])
         for i, view in enumerate(self.views):
             self._draw_arm(i, view, n, strength)
-        for tie, (a, b) in zip(poses.loops.ties, poses.tied[n], strict=True):
-            joints += [a, b] if tie.is_rod else [a]
-            if tie.is_rod:
-                self.axes.plot(*np.stack([a, b]).T, color=mixed(UNDESIGNED, strength), lw=BAR)
-            elif (across := _across(tie)) is not None:
-                corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * BLOCK * size
-                along = np.array([across[1], -across[0]])
-                block = a + corners @ np.stack([along, across])
-                self.axes.add_patch(Polygon(block, fc=grey, ec="black", alpha=0.8, zorder=1.9))
+        joints = [*poses.origin[n]]
+        for tie, ends in zip(poses.loops.ties, poses.tied[n], strict=True):
+            joints += self._draw_tie(tie, ends, strength)
         self.axes.plot(*np.transpose(joints), "o", mfc="white", mec="black", ms=DOT)
+        size = 2.0 * DOT if poses.payload else DOT
         colour = mixed(ORANGE, strength)
-        self.axes.plot(
-            *poses.end[n], "o", mfc=colour, mec="black", ms=(2 if poses.payload else 1) * DOT
-        )
+        self.axes.plot(*poses.end[n], "o", mfc=colour, mec="black", ms=size)
+
+    def _draw_tie(self, tie: Tie, ends: np.ndarray, strength: float) -> list[np.ndarray]:
+        """Draw a closure's rod or slider, and return the places (2,), m, of its joints.
+
+        Args:
+            tie: the closure.
+            ends: (2, 2) places of both its frames, m.
+            strength: share of its colours.
+        """
+        if tie.is_rod:
+            self.axes.plot(*ends.T, color=mixed(UNDESIGNED, strength), lw=BAR)
+            return [*ends]
+        if (across := _across(tie)) is not None:
+            along = np.array([across[1], -across[0]])
+            ring = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+            block = ends[0] + ring * BLOCK * self.poses.size @ np.stack([along, across])
+            colour = mixed(BASE, strength)
+            self.axes.add_patch(Polygon(block, fc=colour, ec="black", alpha=0.8, zorder=1.9))
+        return [ends[0]]
 
     def _draw_arm(self, i: int, view: ArmView, n: int, strength: float) -> None:
         """Draw an arm's cells where there is material; one without a design as a bar."""

@@ -86,16 +86,11 @@ class SolidStage:
         """Draw links, rigid bodies, joints and load at an instant."""
         poses, grey = self.poses, mixed(BAR, strength)
         for i, surface in enumerate(self.surfaces):
-            if surface is None:  # a bar to every interface that something sits on
-                for place in poses.sites(i, n):
-                    self._bar(poses.origin[n, i], place, ROD, grey)
+            if surface is not None:
+                self._draw_link(i, surface, n, mixed(STEEL, strength))
                 continue
-            # Surfaces in one plane would show through each other in specks.
-            self.drawn += 1.0 / len(self.surfaces)
-            modes = surface.fields.get("modes", np.zeros((1, 3, 0)))
-            points = poses.material(surface.points, modes, i, n)
-            points = points + self.drawn * APART * self.size * self.studio.back
-            self.studio.solid(Surface(points, surface.triangles), color=mixed(STEEL, strength))
+            for place in poses.sites(i, n):  # a bar to every interface that something sits on
+                self._bar(poses.origin[n, i], place, ROD, grey)
         for i, parent in enumerate(poses.parents):
             joint, origin = poses.mechanism.joints[i], poses.origin[n, i]
             if parent != GROUND:
@@ -110,6 +105,22 @@ class SolidStage:
             self.studio.ball(a, PIN * self.size, grey)
         radius = BALL if poses.payload else 0.5 * BALL
         self.studio.ball(poses.end[n], radius * self.size, mixed(ORANGE, strength))
+
+    def _draw_link(self, i: int, surface: Surface, n: int, colour: str) -> None:
+        """Draw the material of a link.
+
+        Args:
+            i: number of the body.
+            surface: of its material, in its frame, m.
+            n: the instant.
+            colour: of it.
+        """
+        # Surfaces in one plane would show through each other in specks.
+        self.drawn += 1.0 / len(self.surfaces)
+        modes = surface.fields.get("modes", np.zeros((1, 3, 0)))
+        points = self.poses.material(surface.points, modes, i, n)
+        points = points + self.drawn * APART * self.size * self.studio.back
+        self.studio.solid(Surface(points, surface.triangles), color=colour)
 
     def _bar(self, start: np.ndarray, end: np.ndarray, radius: float, colour: str) -> None:
         """Draw a round bar; its radius is a share of the machine's size."""

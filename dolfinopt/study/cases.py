@@ -163,8 +163,8 @@ class Outcome:
 
     def deviation(self) -> tuple[np.ndarray, np.ndarray]:
         """Return sample instants (n,), s, and the end-effector's distance from its path (n,), m."""
-        brief, whole = self.folder / DEVIATION, self.folder / TRAJECTORY
-        with np.load(brief if brief.exists() else whole, allow_pickle=False) as data:
+        brief, complete = self.folder / DEVIATION, self.folder / TRAJECTORY
+        with np.load(brief if brief.exists() else complete, allow_pickle=False) as data:
             return data["t"], lengths(data["deviation"])
 
     def summary(self) -> dict[str, Any]:
@@ -509,11 +509,11 @@ def _optimise(case: Case, place: _Place) -> None:
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:
     """Simulate one design in many scenes."""
-    found = simulate_scenarios([_unnamed(case) for case in job], design)
+    results = simulate_scenarios([_unnamed(case) for case in job], design)
     for case in job:
         place.check()
         begun = time.perf_counter()
-        result = next(found)
+        result = next(results)
         wall = time.perf_counter() - begun
         if isinstance(result, ConvergenceError):
             place.fail(case, str(result))

@@ -137,7 +137,7 @@ def matrix_figure(figure: FrameFigure) -> Figure:
 
     Columns: "made for ...", what designs i were made for; their values, one for each j; panel.
     """
-    panels, made = list(figure.frame.groupby("panel", sort=False)), figure.frame.columns[0]
+    panels, made_for = list(figure.frame.groupby("panel", sort=False)), figure.frame.columns[0]
     count = len(panels[0][1])
     side = max(3.6, 0.62 * count + 1.6)
     drawn, grid = _grid(figure.title, 1, len(panels), side, side)
@@ -148,9 +148,9 @@ def matrix_figure(figure: FrameFigure) -> Figure:
             dark = abs(value) > 0.6 * LOSS
             axes.text(j, i, f"{value:.2f}", ha="center", va="center", color="w" if dark else "k",
                       fontsize=9 if count <= CROWD else 7)  # fmt: skip
-        axes.set_xticks(range(count), part[made])
-        axes.set_yticks(range(count), part[made])
-        _label(axes, title, made.replace("made for", "used at", 1), made)
+        axes.set_xticks(range(count), part[made_for])
+        axes.set_yticks(range(count), part[made_for])
+        _label(axes, title, made_for.replace("made for", "used at", 1), made_for)
         ends = {(False, False): "neither", (True, False): "min", (False, True): "max"}
         beyond = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
         drawn.colorbar(image, ax=axes, shrink=0.8, extend=ends.get(beyond, "both"))

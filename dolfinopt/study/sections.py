@@ -97,9 +97,9 @@ class Members:
 
     def mass(self, arm: int, share: float) -> float:
         """Return the mass of one arm, kg."""
-        one = self.scene.arms[arm]
+        link = self.scene.arms[arm]
         density = self.scene.material_of(arm).density
-        return density * one.length * self.section.area(one.height, one.thickness, share)
+        return density * link.length * self.section.area(link.height, link.thickness, share)
 
     def total_mass(self, shares: Shares) -> float:
         """Return the mass of all arms, those that share another's design too, kg."""
@@ -135,7 +135,7 @@ class Members:
         for k, share in zip(self.arms, shares, strict=True):
             arm = self.scene.arms[k]
             size = self.section.measures(arm.height, arm.thickness, share)
-            texts.append(f"{arm.name} " + " x ".join(f"{1e3 * one:.4g}" for one in size))
+            texts.append(f"{arm.name} " + " x ".join(f"{1e3 * length:.4g}" for length in size))
         return ", ".join(texts)
 
     def case(self, shares: Shares) -> Case:
@@ -183,7 +183,7 @@ def _bar_cells(length: float, height: float, thickness: float, solid: bool) -> t
 
 def simulated(pairs: Sequence[tuple[Members, Shares]], runner: Runner) -> list[Outcome]:
     """Simulate members with their shares (collective)."""
-    cases = on_root(runner.world, lambda: [one.case(shares) for one, shares in pairs])
+    cases = on_root(runner.world, lambda: [members.case(shares) for members, shares in pairs])
     done = runner.run(cases)
     return [done[case] for case in cases]
 
@@ -194,8 +194,8 @@ def simulated(pairs: Sequence[tuple[Members, Shares]], runner: Runner) -> list[O
 def limited(outcome: Outcome) -> dict[str, float]:
     """Return ln(1 + excess) of every limit that material helps to hold; <= 0 where it is held."""
     return {
-        name: math.log(max(1e-9, 1.0 + _excess(one)))
-        for name, one in outcome.summary().get("constraints", {}).items()
+        name: math.log(max(1e-9, 1.0 + _excess(limit)))
+        for name, limit in outcome.summary().get("constraints", {}).items()
         if not name.startswith(OF_MATERIAL)
     }
 
@@ -302,21 +302,23 @@ def _balanced(
     # The first is of the shares to set out from, the others of `stepped`, with one arm's changed;
     # `move` is the largest change of a share's logarithm.
     base, *changed = map(limited, outcomes)
-    names = [name for name in base if all(name in one for one in changed)]
+    names = [name for name in base if all(name in excesses for excesses in changed)]
     if not names:
         return shares
     start = np.log(shares)
     steps = [math.log(after[k] / shares[k]) for k, after in enumerate(stepped)]
     slopes = np.array(
-        [[(one[name] - base[name]) / step for one, step in zip(changed, steps, strict=True)]
-         for name in names]
-    )  # fmt: skip
+        [
+            [(after[name] - base[name]) / step for after, step in zip(changed, steps, strict=True)]
+            for name in names
+        ]
+    )
     values = np.array([base[name] for name in names])
-    whole = members.total_mass(shares)
+    total = members.total_mass(shares)
     low, high = math.log(LEAST), math.log(members.most)
     bounds = [(max(low, x - move), min(high, x + move)) for x in start]
     result = minimize(
-        lambda x: members.total_mass(tuple(np.exp(x))) / whole,
+        lambda x: members.total_mass(tuple(np.exp(x))) / total,
         start,
         method="SLSQP",
         bounds=bounds,
@@ -326,7 +328,7 @@ def _balanced(
             "jac": lambda x: -slopes,
         },
     )
-    return tuple(float(one) for one in np.exp(result.x)) if result.success else shares
+    return tuple(float(share) for share in np.exp(result.x)) if result.success else shares
 
 
 # -- the study -------------------------------------------------------------------------------
@@ -338,14 +340,14 @@ class Row:
 
     Attributes:
         kind: of the section, or the design.
-        made: how its sizes were chosen.
+        sizing: how its sizes were chosen.
         sizes: in mm, with the arms' names and what they are.
         outcome: of its simulation.
         lightest: whether the sizes are the least that hold the limits, if any do.
     """
 
     kind: str
-    made: str
+    sizing: str
     sizes: str
     outcome: Outcome
     lightest: bool = False
@@ -365,7 +367,7 @@ class Row:
 def _limits(outcome: Outcome) -> dict[str, Any]:
     """Return the scene's limits and what becomes of them, without that of the volume."""
     result = outcome.summary().get("constraints", {})
-    return {name: one for name, one in result.items() if not name.startswith("volume_fraction")}
+    return {name: limit for name, limit in result.items() if not name.startswith("volume_fraction")}
 
 
 def study_sections(scene: Scene, designs: Sequence[Path], runner: Runner) -> Study:
@@ -384,18 +386,24 @@ def study_sections(scene: Scene, designs: Sequence[Path], runner: Runner) -> Stu
     first = Row(DESIGN, label, "", runner.run([own])[own])
     if first.outcome.failure:
         return Study(NAME, (), (), tuple(first.outcome.failures), runner.computed)
-    every = [Members(scene, kind, one, runner) for kind, one in KINDS[scene.dimension].items()]
+    every = [
+        Members(scene, kind, section, runner) for kind, section in KINDS[scene.dimension].items()
+    ]
     asked: list[tuple[Members, str, Shares, bool]] = []
-    for one in every if limited(first.outcome) else ():
-        if found := lightest(one, lambda wanted: simulated([(one, s) for s in wanted], runner)):  # noqa: B023
-            shares, holds = found
-            asked.append((one, "lightest" if holds else "nearest to the limits", shares, holds))
-    asked += [(one, SAME, shares, False) for one, shares in _as_heavy(every, first.outcome)]
-    outcomes = simulated([(one, shares) for one, _, shares, _ in asked], runner)
+    for members in every if limited(first.outcome) else ():
+
+        def simulate(wanted: Sequence[Shares]) -> list[Outcome]:
+            return simulated([(members, shares) for shares in wanted], runner)  # noqa: B023
+
+        if result := lightest(members, simulate):
+            shares, holds = result
+            asked.append((members, "lightest" if holds else "nearest to the limits", shares, holds))
+    asked += [(members, SAME, shares, False) for members, shares in _as_heavy(every, first.outcome)]
+    outcomes = simulated([(members, shares) for members, _, shares, _ in asked], runner)
     rows = [first]
-    for (one, made, shares, light), outcome in zip(asked, outcomes, strict=True):
-        sizes = f"{one.section.named}: {one.sizes(shares)}"
-        rows.append(Row(one.kind, made, sizes, outcome, light))
+    for (members, sizing, shares, light), outcome in zip(asked, outcomes, strict=True):
+        sizes = f"{members.section.named}: {members.sizes(shares)}"
+        rows.append(Row(members.kind, sizing, sizes, outcome, light))
     with together(runner.world):
         found_table, figures = report(scene, rows)
     # A member that is too soft to be simulated is a finding, in its row, and no failure.
@@ -405,7 +413,9 @@ def study_sections(scene: Scene, designs: Sequence[Path], runner: Runner) -> Stu
 def _as_heavy(every: Sequence[Members], outcome: Outcome) -> list[tuple[Members, Shares]]:
     """Return the members that have the masses of what was simulated in every arm."""
     masses = outcome.summary()["mass"]
-    return [(one, shares) for one in every if (shares := one.of_mass(masses)) is not None]
+    return [
+        (members, shares) for members in every if (shares := members.of_mass(masses)) is not None
+    ]
 
 
 AHEAD = ("solid bar", "rectangular tube", "round tube")  # whose figures come before a design
@@ -429,22 +439,22 @@ def ahead(scene: Scene, runner: Runner) -> list[str]:
         return []
     every = _as_heavy([Members(scene, kind, KINDS[3][kind], runner) for kind in AHEAD], first)
     pairs = zip(every, simulated(every, runner), strict=True)
-    found = [(one, outcome) for (one, _), outcome in pairs if not outcome.failure]
-    lines = [_reached(scene, *one) for one in found]
-    if any(one.section.plane is not None for one, _ in found):
+    reached = [(item, outcome) for (item, _), outcome in pairs if not outcome.failure]
+    lines = [_reached(scene, *item) for item in reached]
+    if any(item.section.plane is not None for item, _ in reached):
         lines.append("with walls, arms.hollow = true, a link keeps a tube's outer surface")
     return lines
 
 
-def _reached(scene: Scene, members: Members, found: Outcome) -> str:
+def _reached(scene: Scene, members: Members, outcome: Outcome) -> str:
     """Return mass and objective of members in words."""
-    response, limits = scene.objective.response, _limits(found)
-    value = with_unit(f"{response.label} {found.objective:.4g}", response.unit)
+    response, limits = scene.objective.response, _limits(outcome)
+    value = with_unit(f"{response.label} {outcome.objective:.4g}", response.unit)
     if limits:
-        name, most = max(limits.items(), key=lambda one: _excess(one[1]))
+        name, most = max(limits.items(), key=lambda item: _excess(item[1]))
         used = f"{name.replace('_', ' ')} {most['value']:.3g} of {most['limit']:.3g}"
         value = f"{value}, {with_unit(used, most['unit'])}"
-    mass = found.summary()["designed_mass"]
+    mass = outcome.summary()["designed_mass"]
     return f"a straight {members.kind} of the links' mass at the start, {mass:.3g} kg: {value}"
 
 
@@ -541,8 +551,8 @@ def _notes(scene: Scene, rows: Sequence[Row]) -> list[str]:
     ]
     if len({owner for owner in scene.owners if owner is not None}) > 1:
         notes.append("Every arm has its own size.")
-    found = {row.kind for row in rows if row.made == SAME}
-    if missing := [kind for kind in KINDS[scene.dimension] if kind not in found]:
+    kinds = {row.kind for row in rows if row.sizing == SAME}
+    if missing := [kind for kind in KINDS[scene.dimension] if kind not in kinds]:
         notes.append(f"No {' or '.join(missing)} in the envelope has the design's mass.")
     return notes
 
@@ -551,7 +561,12 @@ def _cells(scene: Scene, row: Row) -> dict[str, Any]:
     """Return a row by column."""
     outcome, known = row.outcome, results_of(row.outcome)
     cells: dict[str, Any]
-    cells = {"section": row.kind, "made": row.made, "sizes [mm]": row.sizes, "mass [kg]": row.mass}
+    cells = {
+        "section": row.kind,
+        "made": row.sizing,
+        "sizes [mm]": row.sizes,
+        "mass [kg]": row.mass,
+    }
     cells[f"objective [{scene.objective.response.unit}]"] = outcome.objective
     for name in (COMPLIANCE, DEVIATION, "settling [mm]", "stress [MPa]", "grayness [-]"):
         cells[name] = known[name]

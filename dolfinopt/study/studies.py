@@ -248,20 +248,20 @@ def lines_by(frame: pd.DataFrame, by: str, x: str, y: str, label: str = "") -> t
     )
 
 
-def deviation_panels(found: Sequence[Outcome]) -> list[Panel]:
+def deviation_panels(outcomes: Sequence[Outcome]) -> list[Panel]:
     """Return the deviation over time; designs of another magnitude get a panel of their own."""
     panels = []
-    for group in magnitudes(found, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
+    for group in magnitudes(outcomes, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
         curves = ((item.case.label, *item.deviation()) for item in group)
         lines = tuple(Line(label, t, 1e3 * distance) for label, t, distance in curves)
         panels.append(Panel("", "time [s]", "deviation [mm]", lines))
     return panels
 
 
-def design_figure(name: str, title: str, found: Sequence[Outcome]) -> DesignFigure:
+def design_figure(name: str, title: str, outcomes: Sequence[Outcome]) -> DesignFigure:
     """Return the designs beside one another, each with its results."""
     designs = []
-    for item in found:
+    for item in outcomes:
         figures = f"{item.compliance:.4g} N m, {1e3 * item.max_deviation:.4g} mm"
         designs.append((f"{item.case.label}: {figures}", item.case.scene, item.design))
     return DesignFigure(name, title, tuple(designs))
@@ -332,8 +332,8 @@ def _sweep(
         columns = {vary.axis: float(value) for vary, value in settings}
         points.append((label, there, {"swept": swept, "point": j} | columns))
 
-    def rows(role: str, name: str, designs: Sequence[Design], made: int = -1) -> Rows:
-        known = {"role": role, "design": name * (role == "shown"), "made for": made}
+    def rows(role: str, name: str, designs: Sequence[Design], made_for: int = -1) -> Rows:
+        known = {"role": role, "design": name * (role == "shown"), "made for": made_for}
         return [
             (known | columns, Case(there, "simulate", design, f"{name}, {label}"))
             for (label, there, columns), design in zip(points, designs, strict=True)
@@ -463,7 +463,7 @@ def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     none = {"": math.nan}
     forces = [np.array([*item.get("drive_rms", none).values()]) for item in result]
     by = 1.0 if weights is None else np.array(weights)
-    whole = frame.rename(columns={"label": "objective"}).assign(
+    table = frame.rename(columns={"label": "objective"}).assign(
         **{"effort [-]": [float(np.linalg.norm(force * by)) for force in forces]},
         **{"mass [kg]": [sum(item.get("mass", none).values()) for item in result]},
     )
@@ -472,7 +472,7 @@ def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     title = "Designs optimised for every objective, simulated in the scene."
     good = [outcome for outcome in frame["outcome"] if not outcome.failure]
     designs = design_figure("designs", "Designs by objective", good)
-    return [Table("", title, whole[columns])], [designs]
+    return [Table("", title, table[columns])], [designs]
 
 
 # -- coordinates and reductions --------------------------------------------------------------
@@ -510,9 +510,9 @@ def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
     called = reduction_name(reference)
     rows: Rows = []
     for other in reductions(scene, counts, OPTIMISED):
-        made = Case(other, "optimize", label=reduction_name(other))
-        again = Case(reference, "simulate", made, f"{made.label} in {called}")
-        rows += [(_reduction(other) | {"role": "own"}, made)]
+        optimised = Case(other, "optimize", label=reduction_name(other))
+        again = Case(reference, "simulate", optimised, f"{optimised.label} in {called}")
+        rows += [(_reduction(other) | {"role": "own"}, optimised)]
         rows += [(_reduction(other) | {"role": "again"}, again)]
     return Plan("reduction", rows, partial(_reductions, called=called))
 
@@ -531,8 +531,8 @@ def _reductions(frame: pd.DataFrame, called: str) -> Report:
     }
     rest = {name: own[name] for name in ("grayness [-]", "iterations", "seconds")}
     title = f"Designs optimised with every reduction, simulated with {called}"
-    whole = pd.DataFrame(known | compared | rest | {"ended by": ended})
+    table = pd.DataFrame(known | compared | rest | {"ended by": ended})
     pairs = zip(own["outcome"], again["outcome"], strict=True)
     simulated = [replace(b, case=a.case) for a, b in pairs if not (a.failure or b.failure)]
     figures: list[Figure] = [design_figure("designs", title, simulated)] * bool(simulated)
-    return [Table("", f"{title} as well.", whole)], figures
+    return [Table("", f"{title} as well.", table)], figures

@@ -198,12 +198,12 @@ def test_deviation_shows_millimetres_and_names_the_largest():
 def test_motion_shows_the_payload_where_it_is(tmp_path):
     views, mechanism = manipulator(2)
     moving = swinging(mechanism)
-    path = machine.draw_motion(tmp_path / "motion.gif", views, moving, frames=4, duration=0.2)
+    film = machine.make_film(moving, frames=4)
+    path = machine.draw_motion(tmp_path / "motion.gif", views, film)
     assert [p.name for p in tmp_path.iterdir()] == ["motion.gif"]
-    film = machine.make_film(moving, None, 4)
     axes = machine.film_stage(views, film, 1.0).axes
     with Image.open(path) as gif:
-        assert (gif.n_frames, gif.info["duration"], gif.info["loop"]) == (4, 50, 0)
+        assert (gif.n_frames, gif.info["duration"], gif.info["loop"]) == (4, 1500, 0)
         pictures = []
         for frame in range(4):
             gif.seek(frame)

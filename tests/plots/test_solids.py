@@ -129,7 +129,7 @@ def test_film_in_space(result, tmp_path):
             assert middle == pytest.approx(film.bent.outboard[n, i], abs=2e-3)
     bent = film.trace - film.desired
     assert np.abs(bent - 2.0 * one.deviation).max() < 0.1 * np.abs(bent).max()
-    path = machine.draw_motion(tmp_path / "motion.gif", result.views, one, frames=4)
+    path = machine.draw_motion(tmp_path / "motion.gif", result.views, film)
     with Image.open(path) as found:
         assert found.n_frames == 4
         images = []
