@@ -131,8 +131,8 @@ class SolidStage:
         self.kept = set(self.studio.plotter.actors)
 
     def moving(self) -> list[Artist]:
-        """Return the rendered image, and what stands over it."""
-        return [item for item in self.axes.get_children() if item is not self.axes.patch]
+        """Return the rendered image, then the ruler and the directions, which stand over it."""
+        return [self.image, *self.axes.lines, *self.axes.texts]
 
     def clear(self) -> None:
         """Take away what was drawn since."""

@@ -136,5 +136,7 @@ def test_film_in_space(result, tmp_path):
         for n in range(4):
             found.seek(n)
             images.append(np.asarray(found.convert("RGB")).astype(int))
+    dark = images[0].sum(axis=2) < 150
+    assert dark.sum(axis=0).max() < 0.2 * len(dark)  # no frame about what has a ruler
     for before, after in pairwise(images):
         assert (np.abs(after - before).sum(axis=2) > 60).mean() > 0.01
