@@ -144,7 +144,15 @@ def history_panels(
 def _draw_history_panel(
     axes: Axes, iteration: np.ndarray, label: str, values: np.ndarray, limit: float | None
 ) -> None:
-    """Draw one quantity, and its limit as a broken line; first and last value stand above it."""
+    """Draw one quantity, and its limit as a broken line; first and last value stand above it.
+
+    Args:
+        axes: the panel's.
+        iteration: (n,).
+        label: name and unit.
+        values: (n,) in that unit; nan where it is not known.
+        limit: in the same unit; None of what has no limit.
+    """
     is_share, positive = label.startswith(SHARES), values > 0.0
     if not is_share and positive.any():  # nothing has changed yet at the first row
         values = np.where(positive, values, np.nan)
@@ -252,7 +260,15 @@ def deviation_figure(
 def _draw_distance(
     axes: Axes, name: str, t: np.ndarray, distance: np.ndarray, style: Mapping[str, Any]
 ) -> None:
-    """Draw a distance (n,), mm, its largest value marked and told in the legend."""
+    """Draw a distance, its largest value marked and told in the legend.
+
+    Args:
+        axes: where.
+        name: of the design or form; "" of a single one.
+        t: (n,) s.
+        distance: (n,) mm.
+        style: of the curve, see `look`.
+    """
     worst = int(np.argmax(distance))
     note = f"largest {distance[worst]:.4g} mm at {t[worst]:.3f} s"
     mark = {"marker": "o", "markevery": [worst], "clip_on": False}
@@ -291,7 +307,14 @@ def check_figure(check: Check, scene: Scene) -> Figure:
 def _over_time(
     axes: Axes, t: np.ndarray, label: str, limits: Sequence[tuple[float, float, float]] = ()
 ) -> None:
-    """Label lengths over time, and draw their limits as broken lines."""
+    """Label lengths over time, and draw their limits as broken lines.
+
+    Args:
+        axes: where.
+        t: (n,) s.
+        label: of y.
+        limits: m, each with the first and the last instant at which it holds, s.
+    """
     for limit, first, last in limits:
         axes.hlines(MILLI * limit, first, last, color=LIMIT, ls="--", lw=1.0)
     axes.set(xlim=(t[0], t[-1]), ylabel=label)

@@ -102,7 +102,14 @@ def poses_figure(
 
 
 def _name_instant(drawn: Stage, poses: Poses, n: int, words: str) -> None:
-    """Write an instant beyond the end-effector; of a plane loop beyond the first arm's end."""
+    """Write an instant beyond the end-effector; of a plane loop beyond the first arm's end.
+
+    Args:
+        drawn: the figure.
+        poses: all that could be shown.
+        n: the number of the instant among them.
+        words: what is written.
+    """
     # That tells poses of a loop apart: a slider comes back.
     loop = bool(poses.loops.ties) and poses.end.shape[1] == 2
     end, inner = drawn.flat(
@@ -235,7 +242,13 @@ def draw_motion(path: PathLike, views: Sequence[ArmView], film: Film) -> Path:
 
 
 def film_stage(views: Sequence[ArmView], film: Film, speed: float) -> Stage:
-    """Return the stage of a film with what does not move; `speed` is over that of real time."""
+    """Return the stage of a film with what does not move.
+
+    Args:
+        views: of all arms, reduced, in the mechanism's order.
+        film: how it moves.
+        speed: of the film, over that of real time.
+    """
     words = f"deformation x {film.magnification:g}, shown at {speed:.2g} x real time"
     drawn = stage(views, film.bent, [film.desired, film.trace], words)
     names = {"rigid machine and its path": GREY, "path of the flexible one": ORANGE}

@@ -43,7 +43,14 @@ class PlaneStage:
     def __init__(
         self, views: Sequence[ArmView], poses: Poses, paths: Sequence[np.ndarray], title: str
     ) -> None:
-        """Draw the ground; lengths on it are in shares of the arms' reach."""
+        """Draw the ground; lengths on it are in shares of the arms' reach.
+
+        Args:
+            views: of all arms, in the mechanism's order.
+            poses: all that will be drawn.
+            paths: (n, 2) m each, that will be drawn.
+            title: above the figure.
+        """
         self.views, self.poses, size = views, poses, poses.size
         self.rims = [boundary(view.corners) for view in views]
         self.stands = np.ptp(poses.held[:, 0], axis=0).max() == 0.0
@@ -136,7 +143,13 @@ class PlaneStage:
         self.axes.add_collection(cells, autolim=False)
 
     def _draw_support(self, place: np.ndarray, moves: bool, strength: float = 1.0) -> None:
-        """Draw a cart below a joint, or a pedestal on its ground."""
+        """Draw a cart below a joint, or a pedestal on its ground.
+
+        Args:
+            place: (2,) of the joint, m.
+            moves: whether it is a cart.
+            strength: share of its colour.
+        """
         across, deep = CART * self.poses.size
         top = across if moves else TOP * across
         box = np.array([[-across, -deep], [across, -deep], [top, 0.0], [-top, 0.0]])
@@ -147,7 +160,12 @@ class PlaneStage:
             self.axes.plot(*ground.T, color=GREY, lw=THIN)
 
     def _draw_closure(self, tie: Tie, ends: np.ndarray) -> None:
-        """Draw what stands of a closure with the ground, places (2, n, 2), m: guide or pedestal."""
+        """Draw what stands of a closure with the ground: guide or pedestal.
+
+        Args:
+            tie: the closure.
+            ends: (2, n, 2) places of both its frames at n instants, m.
+        """
         if tie.b is not None:
             return
         held, point = ends[0], ends[1][0]

@@ -247,7 +247,15 @@ def draw_link(
 
 
 def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: Any) -> None:
-    """Draw a surface, the edges of its box if they are wanted, and a ruler along these."""
+    """Draw a surface, the edges of its box if they are wanted, and a ruler along these.
+
+    Args:
+        axes: the link's, whose scale stays.
+        box: lowest and highest corner (3,) of the link, m.
+        surface: in the link's frame, m.
+        edges: whether the box is drawn.
+        look: colours, see `Studio.solid`.
+    """
     limits = (*axes.get_xlim(), *axes.get_ylim())
     scale = axes.bbox.width / (limits[1] - limits[0])  # px per m
     studio = Studio(LINKS, *_seen(box), scale)
@@ -262,7 +270,13 @@ def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: 
 
 
 def _draw_ruler(axes: Axes, low: np.ndarray, high: np.ndarray, scale: float) -> None:
-    """Draw lengths along the lower front edge of a link's box, mm, and the directions."""
+    """Draw lengths along the lower front edge of a link's box, mm, and the directions.
+
+    Args:
+        axes: the link's.
+        low, high: (3,) corners of the box, m.
+        scale: px per m.
+    """
 
     def at_front(x: float) -> np.ndarray:
         return LINKS.plane(np.array([x, low[1], high[2]]))

@@ -37,7 +37,14 @@ class SolidStage:
     def __init__(
         self, views: Sequence[ArmView], poses: Poses, paths: Sequence[np.ndarray], title: str
     ) -> None:
-        """Draw the plate that the machine stands on, its pedestal, a ruler and the directions."""
+        """Draw the plate that the machine stands on, its pedestal, a ruler and the directions.
+
+        Args:
+            views: of all arms, in the mechanism's order.
+            poses: all that will be drawn.
+            paths: (n, 3) m each, that will be drawn.
+            title: above the figure.
+        """
         self.views, self.poses, self.size = views, poses, poses.size
         modes = bool(poses.q_e.any())
         self.surfaces = [material(view, modes=modes) if view.designed else None for view in views]
