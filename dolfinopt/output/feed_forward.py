@@ -30,11 +30,11 @@ FILE = "feed_forward.csv"
 ROUNDING = 1e-6  # of an eigenvalue's real part, over its size
 
 
-# -- machines beside it ----------------------------------------------------------------------
+# -- what it is compared with --------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class Beside:
+class Comparison:
     """What a machine with feed-forward is compared with; None where that is not solved.
 
     Attributes:
@@ -47,7 +47,7 @@ class Beside:
     finer: float | None
 
 
-def machines_beside(run: RankResult) -> Beside | None:
+def comparison_of(run: RankResult) -> Comparison | None:
     """Simulate the design without its feed-forward, and in a finer model with it (collective).
 
     None where the scene has no feed-forward.
@@ -61,11 +61,13 @@ def machines_beside(run: RankResult) -> Beside | None:
         plain = simulated_with(with_feed_forward(scene, "none"), *place)
         finer = finer_deviation(scene, *place, held)
 
-    def comparison() -> Beside:
+    def comparison() -> Comparison:
         if plain is None:
-            return Beside(None, {}, finer)
+            return Comparison(None, {}, finer)
         peaks = map(float, plain.drives[0][scene.driven_columns])
-        return Beside(plain.max_deviation[0], dict(zip(scene.driven, peaks, strict=True)), finer)
+        return Comparison(
+            plain.max_deviation[0], dict(zip(scene.driven, peaks, strict=True)), finer
+        )
 
     return on_root(run.partition.world, comparison)
 
@@ -152,7 +154,7 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
 
 
 def summary_of_feed_forward(
-    scene: Scene, feed_forward: FeedForward | None, comparison: Beside | None
+    scene: Scene, feed_forward: FeedForward | None, comparison: Comparison | None
 ) -> dict[str, Any] | None:
     """Return what summary.json tells of a feed-forward; None without."""
     if feed_forward is None or comparison is None:

@@ -24,7 +24,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
-from dolfinopt.output.feed_forward import lead_warnings, machines_beside, summary_of_feed_forward
+from dolfinopt.output.feed_forward import comparison_of, lead_warnings, summary_of_feed_forward
 from dolfinopt.output.joint_limits import JointLimit, joint_limits
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import (
@@ -121,7 +121,7 @@ def summarise(
     """
     scene, partition = run.scene, run.partition
     cost = _cost(run, wall)  # without what follows
-    traits, comparison = _gather_traits(run), machines_beside(run)
+    traits, comparison = _gather_traits(run), comparison_of(run)
     stiffening = stiffening_of(run.arms)
     with together(partition.world):
         if partition.world.rank != 0:
