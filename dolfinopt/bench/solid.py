@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ CELLS = (90, 9, 6), (120, 12, 8), (180, 18, 12), (260, 26, 17), (310, 31, 20), (
 QUICK = (40, 4, 3), (60, 6, 4)
 DYNAMIC, STATIC, PLAIN = "dolfinopt", "dolfinopt, one load", "plain DOLFINx, one load"
 DESIGNS = "first design", "nearby design"
+STATIC_CELLS = (64, 8, 8), (112, 16, 12), (156, 20, 16)  # under one load: three grids divide them
 LOAD = 0.0, 1.0, 0.0, 0.0, 0.0, 0.0  # N across the end
 Cells = tuple[int, int, int]
 Found = tuple[int, str, list[float]]  # dofs of all ranks, solver, CPU seconds by design
@@ -117,12 +118,13 @@ def _links(plan: Plan) -> Steps:
         for design, seconds in zip(DESIGNS, by_design):  # of plain DOLFINx the first alone
             yield f"{who}, {design}", ranks, dofs, seconds, memory * 2**20 / 1e9, solver
 
-    for ranks, cells in product((1, 2) if mpirun() else (1,), QUICK if plan.quick else CELLS):
+    both = (QUICK, STATIC_CELLS[:1]) if plan.quick else (CELLS, STATIC_CELLS)
+    for ranks, cells in product((1, 2) if mpirun() else (1,), chain(*both)):
         size = f"{' x '.join(map(str, cells))} cells, {ranks} rank{'s' * (ranks > 1)}"
         if solid_bytes(math.prod(cells), ranks) > free_memory():
             yield f"{size} need more memory than is free: left out", list
             continue
-        for who in (DYNAMIC, STATIC, PLAIN):
+        for who in (STATIC,) if cells in STATIC_CELLS else (DYNAMIC, PLAIN):
             yield f"{who}, {size}", partial(rows, who, cells, ranks)
 
 
