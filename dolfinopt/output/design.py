@@ -379,8 +379,8 @@ def _fit(
     for key, values in zip(keys[::2], (centroid, filtered), strict=True):
         if values is not None and (values.shape[:1] != shape or not _are_numbers(values)):
             raise InputError(
-                f"{path}: {key}: expected finite numbers for {len(density)} cells; give a complete "
-                "design"
+                f"{path}: {key}: expected {len(density)} finite numbers or rows of them, one a "
+                "cell; give a complete design"
             )
     density = physical(f"{path}: {keys[1]}", density)
     place = _nearest(path, mesh, centroid[:, : mesh.dim].astype(float))
