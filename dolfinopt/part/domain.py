@@ -7,10 +7,11 @@ on one line or circle within rounding become that line or arc again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from functools import cached_property
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -93,18 +94,27 @@ def recognise(points: np.ndarray, labels: np.ndarray, extent: float) -> list[Edg
         first %= n
     order = (first + np.arange(n + 1)) % n
     points, labels = points[order], labels[order]
-    halt = np.append(stops[order[:-1]], True)
-    halt[0] = False
-    edges: list[Edge] = []
-    spans: list[tuple[int, int]] = []
-    i = 0
-    while i < n:
-        limit = i + 1 + int(np.argmax(halt[i + 1 :]))
-        j, curve = _longest(points[i : limit + 1], near)
-        edges.append(Edge(curve, str(labels[i])))
-        spans.append((i, i + j))
-        i += j
-    return _smoothed(points, halt, edges, spans)
+    halts = np.union1d(np.flatnonzero(stops[order[:-1]]), [0, n])
+    return [
+        Edge(curve, str(labels[a]))
+        for a, b in pairwise(halts)
+        for curve in _curves(points[a : b + 1], near)
+    ]
+
+
+def _curves(points: np.ndarray, near: float) -> Iterator[Curve]:
+    """Yield lines and arcs along points, and splines through those that turn gently."""
+    single, i = [points[0]], 0
+    while i < len(points) - 1:
+        sides, curve = _longest(points[i:], near)
+        i += sides
+        if sides == 1:
+            single.append(points[i])
+        else:
+            yield from _through(single)
+            yield curve
+            single = [points[i]]
+    yield from _through(single)
 
 
 def _longest(points: np.ndarray, near: float) -> tuple[int, Curve]:
@@ -155,36 +165,15 @@ def _circle(points: np.ndarray, near: float, closed: bool = False) -> Arc | None
     return Arc(centre, radius, float(angle[0]), sweep)
 
 
-def _smoothed(
-    points: np.ndarray, halt: np.ndarray, edges: list[Edge], spans: list[tuple[int, int]]
-) -> list[Edge]:
-    """Put splines in place of three and more single sides that turn gently."""
-    result: list[Edge] = []
-    k = 0
-    while k < len(edges):
-        last = k
-        while (
-            spans[k][1] - spans[k][0] == 1
-            and last + 1 < len(edges)
-            and spans[last + 1][1] - spans[last + 1][0] == 1
-            and not halt[spans[last + 1][0]]
-        ):
-            last += 1
-        if last - k >= 2:
-            run = points[spans[k][0] : spans[last][1] + 1]
-            result.append(Edge(_through(run), edges[k].label))
-        else:
-            result += edges[k : last + 1]
-        k = last + 1
-    return result
-
-
-def _through(points: np.ndarray) -> Spline:
-    """Return a spline through points, parametrised by the chords."""
+def _through(points: Sequence[np.ndarray]) -> Iterator[Curve]:
+    """Yield a spline through points, parametrised by the chords; lines between three and fewer."""
+    if len(points) < 4:
+        yield from (Line(a, b) for a, b in pairwise(points))
+        return
     t = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1)))
     # Not-a-knot ends; its second derivative is free there.
     spline = make_interp_spline(t / t[-1], points, k=DEGREE)
-    return Spline(spline.t, spline.c)
+    yield Spline(spline.t, spline.c)
 
 
 def snapped(edge: Edge, axes: np.ndarray, extent: float) -> Edge:

@@ -19,7 +19,7 @@ from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.mesh.hollow import Hull, Member
-from dolfinopt.mesh.solid_cells import TENSOR, msh_bytes
+from dolfinopt.mesh.solid_cells import TENSOR, boundary, msh_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import MM
 from dolfinopt.part.solid.surface import Surface, check_surface
@@ -29,7 +29,6 @@ from dolfinopt.scene.tables.arms import WALL_KEYS
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.mesh.arm_mesh import ArmMesh
 
 
@@ -76,18 +75,7 @@ class HollowPart:
     def surface(self) -> Surface:
         """Outer and inner surface, and the rings between them at both ends, m."""
         mesh = self.hull.member(self.thickness)
-        a, b, c, d = mesh.cells[:, :4].T
-        e, f, g, h = mesh.cells[:, 4:].T
-        around = self.hull.shape[1]
-        first, last = slice(0, around), slice(-around, None)
-        quads = np.concatenate(
-            [
-                np.stack([a, b, f, e], axis=1),
-                np.stack([d, h, g, c], axis=1),
-                np.stack([d, c, b, a], axis=1)[first],
-                np.stack([e, f, g, h], axis=1)[last],
-            ]
-        )
+        quads = boundary(mesh.cells)
         triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
         return Surface(mesh.points, triangles)
 
@@ -181,11 +169,11 @@ class HollowPart:
             result &= across > EDGE_DISTANCE * self.thickness.min()
         return np.asarray(result)
 
-    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
+    def stress(self, state: DesignState) -> CornerStress:
         """Return the stress at the corners of the cells, on both surfaces of the wall."""
         count = len(state.mesh.mesh.geometry.x)
         every = np.ones((state.mesh.num_cells, 8), dtype=bool)
-        return mean_at_corners(state, fields, VERTICES, every, np.ones(count, dtype=bool))
+        return mean_at_corners(state, VERTICES, every, np.ones(count, dtype=bool))
 
 
 def make_hollow_part(mesh: ArmMesh, x_phys: np.ndarray, curves: Curves = DEFAULTS) -> HollowPart:

@@ -519,31 +519,26 @@ def _plate_mesh(flat: PlanePart, size: float) -> PlateMesh:
     return extruded(face, thickness, max(1, round(thickness / size)))
 
 
+# Tetrahedra of a prism, and triangles of its side: numbers of their corners, those below first.
+PRISM, WALL = [[0, 1, 2, 5], [0, 1, 4, 5], [0, 3, 4, 5]], [[0, 1, 3], [0, 3, 2]]
+
+
 def extruded(face: BodyMesh, thickness: float, layers: int) -> PlateMesh:
     """Return prisms over triangles to both sides of z = 0, each cut in three."""
     count = len(face.points)
     heights = np.linspace(-0.5 * thickness, 0.5 * thickness, layers + 1)
     points = np.concatenate([np.column_stack([face.points, np.full(count, z)]) for z in heights])
-    # Corners in ascending order: neighbours cut their common side along the same diagonal.
-    a, b, c = np.sort(face.triangles, axis=1).T
-    prism = np.stack(
-        [
-            np.stack([a, b, c, c + count], axis=1),
-            np.stack([a, b, b + count, c + count], axis=1),
-            np.stack([a, a + count, b + count, c + count], axis=1),
-        ],
-        axis=1,
-    ).reshape(-1, 4)
-    cells = np.concatenate([prism + layer * count for layer in range(layers)])
-    ends = [np.sort(sides, axis=1) for sides in (face.inboard, face.outboard)]
-    walls = []
-    for sides in ends:
-        a, b = sides.T
-        wall = np.concatenate(
-            [np.stack([a, b, b + count], axis=1), np.stack([a, b + count, a + count], axis=1)]
-        )
-        walls.append(np.concatenate([wall + layer * count for layer in range(layers)]))
-    mesh = PlateMesh(points, cells, walls[0], walls[1], face, thickness, layers)
+
+    def layered(nodes: np.ndarray, parts: list[list[int]]) -> np.ndarray:
+        """Return the parts, in every layer, of what nodes below and above them make up."""
+        # Corners in ascending order: neighbours cut their common side along the same diagonal.
+        below = np.sort(nodes, axis=1)
+        first = np.hstack([below, below + count])[:, parts].reshape(-1, len(parts[0]))
+        return np.concatenate([first + layer * count for layer in range(layers)])
+
+    cells = layered(face.triangles, PRISM)
+    inboard, outboard = (layered(sides, WALL) for sides in (face.inboard, face.outboard))
+    mesh = PlateMesh(points, cells, inboard, outboard, face, thickness, layers)
     turned = mesh.volumes < 0.0
     cells[turned] = cells[turned][:, [0, 1, 3, 2]]
     return mesh

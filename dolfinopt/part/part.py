@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.mesh.arm_mesh import ArmMesh
     from dolfinopt.part.stress import CornerStress
 
@@ -155,13 +154,8 @@ class Part(Protocol):
             margin: least distance from the interfaces, m.
         """
 
-    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
-        """Return the stress at the corners of the cells of an arm with such a mesh.
-
-        Args:
-            state: its design.
-            fields: of its loads; all of them by default.
-        """
+    def stress(self, state: DesignState) -> CornerStress:
+        """Return the stress at the corners of the cells of an arm with such a mesh."""
 
 
 def make_parts(

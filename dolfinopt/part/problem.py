@@ -14,12 +14,12 @@ from dolfinopt.part.check import STRESS, Simulated, simulate_parts
 from dolfinopt.part.mesh import BodyMesh, PlateMesh
 from dolfinopt.part.part import Part, PartMesh
 from dolfinopt.part.plane.free_sides import FreeSides
-from dolfinopt.part.stress import HOT, OutlineStress
+from dolfinopt.part.stress import HOT, CornerStress, OutlineStress
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient
 from dolfinopt.responses.products import by_nodes
-from dolfinopt.responses.response import Analysis, objective_of
+from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress import arm_loads, maxima, motions_of
 from dolfinopt.scene.load import Scene
 
@@ -42,7 +42,8 @@ class State:
         shares: relative constraints of the volumes.
         places: relative constraint of the stress of every fillet and side.
         means: p-mean, Pa, of the stress of each of them, which it follows while a mesh does.
-        owners: (n,) number of the place of every node of the arms' meshes; -1: none.
+        stress: of the arms' meshes.
+        owners: (n,) number of the place of every node of them; -1: none.
         hot: (n, d) nodes of the arms' meshes where a finer mesh is worth it, m.
     """
 
@@ -54,6 +55,7 @@ class State:
     shares: np.ndarray
     places: Mapping[Place, float] = field(default_factory=dict)
     means: Mapping[Place, float] = field(default_factory=dict)
+    stress: Mapping[int, CornerStress] = field(default_factory=dict)
     owners: Mapping[int, np.ndarray] = field(default_factory=dict)
     hot: Mapping[int, np.ndarray] = field(default_factory=dict)
 
@@ -166,10 +168,11 @@ class Problem:
         """Return a state with the relative constraint and p-mean of every place."""
         scene, motions = state.simulated.scene, motions_of(state.simulated.trajectory)
         places, means, owners, stresses = dict[Place, float](), {}, {}, {}
+        corners = dict[int, CornerStress]()
         factor = self._factor(Limit(STRESS, "", 0.0, limit, "Pa")) / limit
         for k, loads in arm_loads(scene, motions).items():
             now, part = state.simulated.arms[k].current, every[k].current
-            points = part.stress(now, now.load_fields)
+            points = corners[k] = part.stress(now)
             motion = [load.coefficients for load in loads]
             stress = np.max([maxima(MPI.COMM_SELF, points.A, a)[0] for a in motion], axis=0)
             means_of = points.means(motion, self._exponent)
@@ -189,31 +192,25 @@ class Problem:
             for k, (at, stress) in stresses.items()
             if stress.max() > HOT * largest
         }
-        return replace(state, places=places, means=means, owners=owners, hot=hot)
+        return replace(state, places=places, means=means, stress=corners, owners=owners, hot=hot)
 
     def stress_slopes(self, state: State, keys: Sequence[Place]) -> list[np.ndarray]:
         """Return the derivatives (n,) of `State.places` of some places."""
-        result = []
-        for key in keys:
-            stress, analysis = self._place_stress(state, key)
-            (row,) = stress.gradients(analysis)
-            scale = (1.0 + state.places[key]) / state.means[key]
-            result.append(self._by_x(state, [{k: scale * g for k, g in row.items()}])[0])
-        return result
+        return [self._by_x(state, [self._by_stress(state, *key)])[0] for key in keys]
 
-    def _place_stress(self, state: State, key: Place) -> tuple[OutlineStress, Analysis]:
-        nodes, simulated = {key[0]: state.owners[key[0]] == key[1]}, state.simulated
-        parts = self.parts_of(state.outlines)
-        given = (
-            simulated.scene,
-            simulated.partition,
-            simulated.arms,
-            simulated.trajectory,
-            Profile(),
-            by_nodes,
-        )
-        options = simulated.scene.objective.unchecked_copy({"stress_exponent": self._exponent})
-        return OutlineStress(options, parts, nodes), analysis_of(*given)
+    def _by_stress(self, state: State, arm: int, piece: int) -> dict[int, np.ndarray]:
+        """Return the derivatives of `State.places` of one place by the nodes of all arms."""
+        run = state.simulated
+        options = run.scene.objective.unchecked_copy({"stress_exponent": self._exponent})
+        points = {
+            k: item.counted((state.owners[k] == piece) & (k == arm))
+            for k, item in state.stress.items()
+        }
+        response = OutlineStress(options, lambda k, _: points[k])
+        given = run.scene, run.partition, run.arms, run.trajectory, Profile(), by_nodes
+        (row,) = response.gradients(analysis_of(*given))
+        scale = (1.0 + state.places[arm, piece]) / state.means[arm, piece]
+        return {k: scale * g for k, g in row.items()}
 
     def calibrated(self, state: State) -> tuple[Problem, State]:
         """Return the problem that knows what finer meshes say, and a state on new meshes.

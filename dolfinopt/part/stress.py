@@ -94,7 +94,7 @@ def stress_of_parts(
         if not arms[k].solid.law.has_strength:
             continue
         state = arms[k].current
-        points = parts[k].stress(state, state.load_fields)
+        points = parts[k].stress(state)
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
         peaks: dict[int, tuple[Peak, ArmLoads]] = {}
         for one in loads:
@@ -202,7 +202,6 @@ class CornerStress(PointStress):
 
 def mean_at_corners(
     state: DesignState,
-    fields: LoadFields | None,
     vertices: np.ndarray,
     counts: np.ndarray,
     outer: np.ndarray,
@@ -211,12 +210,11 @@ def mean_at_corners(
 
     Args:
         state: meshed in quadratic triangles or tetrahedra, of solid material.
-        fields: of its loads; None for all of them.
         vertices: (d + 1, d) of the reference cell.
         counts: (n_cells, d + 1) whether a cell counts at its corner.
         outer: (n,) True for nodes of the outline.
     """
-    mesh, fields = state.mesh, fields or state.load_fields
+    mesh, fields = state.mesh, state.load_fields
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
     operator = stress_operator(state.elastic.operators, vertices)
     own = fields.stress(state.solid.modulus * operator)
@@ -230,7 +228,7 @@ def mean_at_corners(
     return CornerStress(fields, A, outer.astype(float), points, corners, vertices, own, shares)
 
 
-def corner_stress(state: DesignState, fields: LoadFields | None = None) -> CornerStress:
+def corner_stress(state: DesignState) -> CornerStress:
     """Return the stress at the corners of a design's triangles or tetrahedra.
 
     At a node of the outline the cells with a side there count: others know less of it.
@@ -248,10 +246,13 @@ def corner_stress(state: DesignState, fields: LoadFields | None = None) -> Corne
     outer = np.zeros(count, dtype=bool)
     outer[corners[touches]] = True
     reference = np.vstack([np.zeros(dim), np.eye(dim)])
-    return mean_at_corners(state, fields, reference, touches | ~outer[corners], outer)
+    return mean_at_corners(state, reference, touches | ~outer[corners], outer)
 
 
 # -- as a response: what shape optimisation limits ------------------------------------------------
+
+
+PointsOf = Callable[[int, "DesignState"], CornerStress]
 
 
 class OutlineStress(Stress):
@@ -263,35 +264,18 @@ class OutlineStress(Stress):
 
     name = "outline_stress"
 
-    def __init__(
-        self,
-        options: Objective,
-        parts: Mapping[int, Part],
-        nodes: Mapping[int, np.ndarray] | None = None,
-    ):
-        """Take the scene's options, and the parts by their place in the chain.
-
-        Of nodes only those count (n,), by the arms; of arms without an entry none.
-        """
+    def __init__(self, options: Objective, points: PointsOf):
+        """Take the scene's options, and what returns the stress of an arm where it counts."""
         super().__init__(options, limited=True)
-        self._parts, self._nodes = parts, nodes
-        self._known: dict[int, Any] = {}
+        self._points = points
 
     def once(self, analysis: Analysis, find: Callable[[], Mapping[int, Any]]) -> dict[int, Any]:
-        """Return what is found of this rank's designs; of some nodes it is their own."""
-        if self._nodes is None:
-            return super().once(analysis, find)
-        if not self._known:
-            self._known = dict(find())
-        return self._known
+        """Return what is found of this rank's designs, which is not kept: of other points."""
+        return dict(find())
 
     def points_of(self, index: int, state: DesignState, fields: LoadFields) -> CornerStress:
-        """Return the stress of an arm's design on its outline."""
-        part = self._parts[index]
-        found = part.stress(state, fields)
-        if self._nodes is not None:
-            return found.counted(self._nodes.get(index, np.zeros(len(found.places), dtype=bool)))
-        return found.counted(part.regular(found.places, self.options.stress_margin))
+        """Return the stress of an arm's design where it counts."""
+        return self._points(index, state)
 
 
 # -- in the plane: on the outline, away from singular points -----------------------------------

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,14 +70,14 @@ def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
     told = (f"arms.mesh='{tmp_path}/bar.geo'", *PLANE) if plane else SPACE
     scene = do.load_scene(ROOT / "demos" / f"{base}.toml", (*ROUGHLY, *told, kind))
 
-    def middle(length: float, places: np.ndarray, margin: float) -> np.ndarray:
+    def middle(length: float, places: np.ndarray) -> np.ndarray:  # cells end at twelfths, fifths
         return (places[:, 0] > 0.15 * length) & (places[:, 0] < 0.85 * length)
 
-    parts = {
-        k: SimpleNamespace(stress=corner_stress, regular=partial(middle, arm.length))
-        for k, arm in enumerate(scene.arms)  # cells end at twelfths, or fifths
-    }
-    response = OutlineStress(scene.objective, parts)
+    def points(k: int, state):
+        every = corner_stress(state)
+        return every.counted(middle(scene.arms[k].length, every.places))
+
+    response = OutlineStress(scene.objective, points)
     size = 0.01 if plane else 0.005  # m, of cells of 20 to 100 mm
     found = node_test(scene, solid, size, cut=not plane, response=response)
     assert found.slope != 0.0
@@ -98,7 +96,12 @@ def test_largest_is_that_of_the_part(tmp_path) -> None:
     parts = make_parts(scene, folder)
     state = simulate_parts(scene, parts, mesh_parts(parts).coarse)
     known = stress_of_parts(state.arms, state.trajectory, parts)
-    response = OutlineStress(scene.objective, parts)
+
+    def points(k: int, design):
+        every = parts[k].stress(design)
+        return every.counted(parts[k].regular(every.places, scene.objective.stress_margin))
+
+    response = OutlineStress(scene.objective, points)
     designs = {k: arm.current for k, arm in state.arms.items()}
     place = state.scene, state.partition, designs, state.trajectory
     found = response.measure(Analysis(*place, do.Profile()))

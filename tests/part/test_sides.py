@@ -94,7 +94,7 @@ def test_area_and_limits_are_differentiated():
     area = differences(sides, lambda some: np.array([some.shape.area]))
     assert sides.area_by_q() == pytest.approx(area[0], rel=1e-6, abs=1e-9)
     assert len(LIMITS.rows(sides)[0]) > 30
-    for kind in ("_of_pieces", "_of_sharp_corners", "_places"):
+    for kind in ("_of_pieces", "_turns", "_places"):
         _, slopes = zip(*getattr(LIMITS, kind)(sides), strict=True)
 
         def rows(some, kind=kind):

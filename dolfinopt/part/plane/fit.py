@@ -62,6 +62,18 @@ class Drawn:
         """Return the mirror image about y = 0, run through with the material to the left."""
         return Drawn(self.side.mirrored(), self.end * MIRROR, self.start * MIRROR)
 
+    def joined(self, after: Drawn) -> dict[int, Drawn]:
+        """Return one side in place of this and the next one, and its image, by their names.
+
+        None where this one crosses the axis of symmetry, as it does then.
+        """
+        side, along = self.side, after.end - self.start
+        if side.twin == side.key:
+            return {}
+        side = replace(side, point=0.5 * (self.start + after.end), angle=angle_of(along))
+        result = Drawn(side, self.start, after.end)
+        return {side.twin: result.mirrored(), side.key: result}
+
     def named(self, key: int = -1, twin: int = -1) -> Drawn:
         """Return it with other names where they are given."""
         key = self.side.key if key < 0 else key
@@ -288,7 +300,7 @@ class _Pen:
     limits: Limits
     names: Iterator[int]
 
-    def radius(self, _: int, place: np.ndarray, half: float) -> float:
+    def radius(self, _: Side, place: np.ndarray, half: float) -> float:
         """Return the radius of a fillet that touches the outline."""
         import shapely
 
@@ -509,10 +521,13 @@ def cleaned(drawn: Sequence[Drawn], limits: Limits) -> list[Drawn]:
         k, merges = _worst(drawn, limits)
         if k is None:
             return drawn
-        drawn = _merged(drawn, k) if merges else drawn
-        gone = drawn[k].names
-        drawn = _distinct([item for item in drawn if not item.names & gone])
+        drawn = without(drawn, drawn[k].names, drawn[k - 1].joined(drawn[k]) if merges else {})
     return []
+
+
+def without(drawn: Sequence[Drawn], gone: set[int], new: Mapping[int, Drawn]) -> list[Drawn]:
+    """Return sides without those of some names, and with new ones in place of others."""
+    return _distinct([new.get(item.side.key, item) for item in drawn if not item.names & gone])
 
 
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
@@ -540,18 +555,6 @@ def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
     return worst, merges
 
 
-def _merged(drawn: list[Drawn], k: int) -> list[Drawn]:
-    """Return sides of which the one before side k runs along both; its mirror image likewise."""
-    before, one = drawn[k - 1], drawn[k]
-    along = one.end - before.start
-    side = replace(before.side, point=0.5 * (before.start + one.end), angle=angle_of(along))
-    made = Drawn(side, before.start, one.end)
-    if side.twin == side.key:
-        return drawn
-    image = made.mirrored()
-    return [made if s is before else image if s.side.key == side.twin else s for s in drawn]
-
-
 def is_rounded(a: Side, b: Side, turn: float, outer: int) -> bool:
     """Return whether the tool rounds the corner between two sides; not those of the arm's own.
 
@@ -567,7 +570,7 @@ def looped(
     drawn: Sequence[Drawn],
     limits: Limits,
     outer: int,
-    radius_at: Callable[[int, np.ndarray, float], float],
+    radius_at: Callable[[Side, np.ndarray, float], float],
 ) -> Loop:
     """Return a loop of sides with fillets at its concave corners.
 
@@ -575,8 +578,8 @@ def looped(
         drawn: the sides.
         limits: of the part; radii are within them, and leave room on the sides.
         outer: number of the arm's own curves.
-        radius_at: returns the wanted radius, m, of the corner before a side of this number, at this
-            place (2,), half of whose turn is this angle.
+        radius_at: returns the wanted radius, m, of the corner before this side, at this place (2,),
+            half of whose turn is this angle.
     """
     places, turns = _vertices(drawn, REACH * limits.cell)
     corners = []
@@ -588,7 +591,7 @@ def looped(
         half = min(-turn / 2.0, STEEP)
         ends = (places[k - 1], places[(k + 1) % len(places)])
         room = ROOM * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
-        radius = min(radius_at(k, place, half), room, 0.9 * LARGEST * limits.cell)
+        radius = min(radius_at(b, place, half), room, 0.9 * LARGEST * limits.cell)
         radius = max(radius, limits.tool, SHORT * limits.cell)
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
         near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)

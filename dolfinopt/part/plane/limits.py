@@ -25,7 +25,6 @@ from dolfinopt.part.plane.curves import (
     Line,
     Piece,
     Spline,
-    curvature,
     direction,
     sampled,
 )
@@ -36,7 +35,6 @@ from dolfinopt.part.plane.sides import (
     OwnMoves,
     Placed,
     Sides,
-    turn_between,
     unit,
 )
 from dolfinopt.part.program import least_move
@@ -88,7 +86,7 @@ class Limits:
         Raises:
             BrokenError: sides do not close to a loop.
         """
-        result = [*self._of_pieces(sides), *self._of_sharp_corners(sides)]
+        result = [*self._of_pieces(sides), *self._turns(sides)]
         result += [*self._widths(sides), *self._places(sides)]
         if not result:
             return np.empty(0), np.empty((0, sides.count))
@@ -97,20 +95,19 @@ class Limits:
         moves = np.abs(A).max(axis=1, initial=0.0) > 1e-9  # others are the arm's own
         return np.array(values)[moves], A[moves]
 
-    def _turn(self, turn: float, slope: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
-        """Yield the rows of a corner's turn, as lengths."""
+    def _turns(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield the rows of the corners' turns, as lengths."""
         reach = 4.0 * self.cell
-        yield reach * (TURN - turn), -reach * slope
-        yield reach * (turn - MOST_TURN), reach * slope
+        for turn, slope in sides.turns:
+            yield reach * (TURN - turn), -reach * slope
+            yield reach * (turn - MOST_TURN), reach * slope
 
     def _of_pieces(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
-        """Yield the rows of lengths, turns of fillets and radii."""
+        """Yield the rows of lengths and radii."""
         for item in sides.placed:
             curve, moves = item.piece.curve, item.moves
             if isinstance(moves, ArcMoves):
                 assert isinstance(curve, Arc)
-                if item.fillet:
-                    yield from self._turn(-curve.sweep, moves.start - moves.end)
                 yield self.tool - curve.radius, -moves.radius
                 yield curve.radius - LARGEST * self.cell, moves.radius
             elif isinstance(moves, LineMoves):
@@ -123,18 +120,6 @@ class Limits:
                 ends = np.linalg.norm(curve.derivative(np.array([0.0, 1.0])), axis=1)
                 slope = ends[1] * moves.end - ends[0] * moves.start
                 yield SHORT * self.cell - float(WEIGHTS @ speed), -slope
-
-    def _of_sharp_corners(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
-        placed = {(item.loop, item.side): item for item in sides.placed if not item.fillet}
-        for i, loop in enumerate(sides.loops):
-            for k, corner in enumerate(loop.corners):
-                a, b = loop.sides[k - 1], loop.sides[k]
-                if corner.radius > 0.0 or not (a.free or b.free):
-                    continue
-                before, after = placed[i, (k - 1) % len(loop.sides)], placed[i, k]
-                ends = direction(before.piece.curve, 1.0), direction(after.piece.curve, 0.0)
-                slope = _angle(sides, after, 0) - _angle(sides, before, 1)
-                yield from self._turn(turn_between(*ends), slope)
 
     # -- widths of members and gaps ---------------------------------------------------------------
 
@@ -270,20 +255,6 @@ def rounded_radii(sides: Sides, limits: Limits) -> Sides:
     made = replace(sides, loops=loops, circles=circles, holds_radii=True)
     result = limits.nearest(made, area=sides.shape.area) or limits.nearest(made)
     return sides if result is None else replace(result[0], holds_radii=False)
-
-
-def _angle(sides: Sides, placed: Placed, end: int) -> np.ndarray:
-    """Return the derivative (n,) by q of the direction's angle at an end of a side."""
-    count, of_sides, _ = sides.numbers
-    result = np.zeros(count)
-    if (at := of_sides.get((placed.loop, placed.side))) is not None:
-        result[at + 1] = 1.0
-    elif isinstance(placed.moves, OwnMoves):
-        t = np.array([float(end)])
-        speed = np.linalg.norm(placed.piece.curve.derivative(t))
-        by_t = (placed.moves.start, placed.moves.end)[end]
-        result = curvature(placed.piece.curve, t)[0] * speed * by_t
-    return result
 
 
 # -- places of the outline that face each other --------------------------------------------------

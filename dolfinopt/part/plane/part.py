@@ -33,7 +33,6 @@ from dolfinopt.part.workshop_files import (
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.stress import CornerStress
 
 
@@ -198,9 +197,9 @@ class PlanePart:
         """Return which places (n, 2) are away from where stress has no limit (n,)."""
         return is_regular_in_plane(self.shape, self.domain.cell, places, margin)
 
-    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
+    def stress(self, state: DesignState) -> CornerStress:
         """Return the stress at the corners of the triangles of its arm."""
-        return corner_stress(state, fields)
+        return corner_stress(state)
 
 
 def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:

@@ -277,6 +277,22 @@ class _Touch:
     by_angle: np.ndarray  # (n,)
 
 
+@dataclass(frozen=True, eq=False)
+class _Meeting:
+    """A corner: centre of its fillet with derivatives, and where it touches both sides."""
+
+    centre: np.ndarray
+    by_centre: np.ndarray  # (2, n)
+    by_radius: np.ndarray  # (n,)
+    before: _Touch
+    after: _Touch
+
+    @property
+    def turn(self) -> float:
+        """By how much the outline turns there, positive to the left, rad."""
+        return turn_between(self.before.normal, self.after.normal)
+
+
 Loops = tuple[Loop, ...]
 
 
@@ -347,18 +363,40 @@ class Sides:
 
     def _of_loops(self) -> Iterator[Placed]:
         for i, loop in enumerate(self.loops):
-            met = [self._meeting(i, k) for k in range(len(loop.sides))]
             for k, side in enumerate(loop.sides):
-                (centre, by_centre, by_radius), before, after = met[k]
+                meeting, after = self._meetings[i, k], self._meetings[i, (k + 1) % len(loop.sides)]
                 if loop.corners[k].radius > 0.0:
-                    turn = turn_between(before.normal, after.normal)
+                    before, behind = meeting.before, meeting.after
                     begin = angle_of(-before.normal)
-                    arc = Arc(centre, loop.corners[k].radius, begin, turn)
-                    moves = ArcMoves(by_centre, by_radius, before.by_angle, after.by_angle)
+                    arc = Arc(meeting.centre, loop.corners[k].radius, begin, meeting.turn)
+                    angles = before.by_angle, behind.by_angle
+                    moves = ArcMoves(meeting.by_centre, meeting.by_radius, *angles)
                     yield Placed(Piece(arc, free=True), moves, i, k, True)
-                yield _side(side, after, met[(k + 1) % len(met)][1], i, k)
+                yield _side(side, meeting.after, after.before, i, k)
 
-    def _meeting(self, i: int, k: int) -> tuple[tuple[np.ndarray, ...], _Touch, _Touch]:
+    @cached_property
+    def _meetings(self) -> dict[tuple[int, int], _Meeting]:
+        """What is at every corner, by its loop and number."""
+        return {
+            (i, k): self._meeting(i, k)
+            for i, loop in enumerate(self.loops)
+            for k in range(len(loop.sides))
+        }
+
+    @property
+    def turns(self) -> Iterator[tuple[float, np.ndarray]]:
+        """By how much the outline turns at every corner that moves, rad, with derivatives (n,).
+
+        Of fillets to the right, of sharp corners to the left.
+        """
+        for (i, k), meeting in self._meetings.items():
+            loop = self.loops[i]
+            sign = -1.0 if loop.corners[k].radius > 0.0 else 1.0
+            if sign < 0.0 or loop.sides[k - 1].free or loop.sides[k].free:
+                slope = meeting.after.by_angle - meeting.before.by_angle
+                yield sign * meeting.turn, sign * slope
+
+    def _meeting(self, i: int, k: int) -> _Meeting:
         """Return a corner's centre with derivatives, and where it touches the sides beside it."""
         loop, (count, of_sides, of_corners) = self.loops[i], self.numbers
         corner, beside = loop.corners[k], ((k - 1) % len(loop.sides), k)
@@ -388,7 +426,7 @@ class Sides:
             out = -left(along)
             by_point = by_centre - np.outer(out, by_radius) - radius * np.outer(along, angle)
             touches.append(_Touch(centre - radius * out, out, by_point, angle))
-        return (centre, by_centre, by_radius), touches[0], touches[1]
+        return _Meeting(centre, by_centre, by_radius, *touches)
 
     def moved(self, q: np.ndarray) -> Sides:
         """Return the outline after a step of q; sides turn about their new middles from then on.

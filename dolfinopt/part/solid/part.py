@@ -37,7 +37,6 @@ from dolfinopt.part.workshop_files import dxf_text, solid_text, three_mf_bytes, 
 
 if TYPE_CHECKING:
     from dolfinopt.arms.design_state import DesignState
-    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.stress import CornerStress
 
 
@@ -232,9 +231,9 @@ class SolidPart:
         """Return which places (n, 3) are away from where stress has no limit (n,)."""
         return is_regular_in_space(self.domain, places, margin)
 
-    def stress(self, state: DesignState, fields: LoadFields | None = None) -> CornerStress:
+    def stress(self, state: DesignState) -> CornerStress:
         """Return the stress at the corners of the tetrahedra of its arm."""
-        return corner_stress(state, fields)
+        return corner_stress(state)
 
 
 def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart:

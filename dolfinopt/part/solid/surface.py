@@ -434,18 +434,13 @@ def open_edges(surface: Surface) -> np.ndarray:
 
 def cavities(surface: Surface) -> np.ndarray:
     """Return the middles (k, 3) of closed cavities, m: sheets that turn inwards."""
-    import scipy.sparse as sp
-    from scipy.sparse.csgraph import connected_components
+    import pyvista
 
-    count, triangles = len(surface.points), surface.triangles
-    ends = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2])])
-    links = sp.coo_matrix((np.ones(len(ends)), ends.T), (count, count))
-    sheets, sheet = connected_components(links, directed=False)
+    _, sheet = _regions(pyvista.PolyData.from_regular_faces(surface.points, surface.triangles))
     a, b, c = surface.corners.swapaxes(0, 1)
-    of = sheet[triangles[:, 0]]
-    volume = np.bincount(of, np.einsum("na,na->n", a, np.cross(b, c)), sheets)
-    middle = np.stack([np.bincount(of, item, sheets) for item in surface.corners.mean(axis=1).T])
-    return np.asarray((middle / np.bincount(of, minlength=sheets).clip(1)).T[volume < 0.0])
+    inwards = np.bincount(sheet, np.einsum("na,na->n", a, np.cross(b, c))) < 0.0
+    middles = [surface.corners[sheet == k].mean(axis=(0, 1)) for k in np.flatnonzero(inwards)]
+    return np.array(middles).reshape(-1, 3)
 
 
 def check_surface(name: str, surface: Surface) -> None:

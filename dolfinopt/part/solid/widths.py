@@ -17,8 +17,6 @@ from dolfinopt.part.plane.limits import FACING
 from dolfinopt.part.solid.surface import Surface
 
 SPACINGS, MOST_POINTS = 5.0, 50_000  # points of the surface in a cell's length; in all, about
-# Steps of the sequence that fills a square most evenly: powers of the root of g^3 = g + 1.
-EVENLY = 0.7548776662466927, 0.5698402909980532
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,12 @@ def measured_widths(domain: SolidDomain, surface: Surface) -> Widths:
     What is thinner than the spacing of the places may be missed; a wedge of more than 37 degrees
     is no member.
     """
-    points, outward, spacing = _places(surface, domain.cell / SPACINGS)
+    import pyvista
+
+    triangles = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
+    spacing = max(domain.cell / SPACINGS, float(np.sqrt(triangles.area / MOST_POINTS)))
+    places = triangles.subdivide_adaptive(max_edge_len=2.0 * spacing)  # of about its square
+    points, outward = np.asarray(places.cell_centers().points), np.asarray(places.face_normals)
     asked = max(domain.filter_radius, domain.minimum_member, domain.minimum_gap, 2.0 * domain.cell)
     extent = float(np.ptp(points, axis=0).max())
     member = _narrowest(surface, points, -outward, (0.5 * spacing, extent), 1.0)
@@ -86,20 +89,3 @@ def _narrowest(
             if sense * normal[int(cell)] @ way > FACING:
                 result.append(first + float(t) * (last - first))
     return min(result, default=None)
-
-
-def _places(surface: Surface, spacing: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return points on a surface, one in a triangle or more, outward normals and their spacing."""
-    a, b, c = surface.corners.swapaxes(0, 1)
-    normal = 0.5 * np.cross(b - a, c - a)
-    area = np.linalg.norm(normal, axis=1)
-    spacing = max(spacing, float(np.sqrt(area.sum() / MOST_POINTS)))
-    counts = np.maximum(np.ceil(area / spacing**2).astype(int), 1) * (area > 0.0)
-    which = np.repeat(np.arange(len(area)), counts)
-    number = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
-    second, third = ((1.0 / 3.0 + number * step) % 1.0 for step in EVENLY)
-    beyond = second + third > 1.0
-    second, third = (np.where(beyond, 1.0 - item, item) for item in (second, third))
-    weights = np.stack([1.0 - second - third, second, third], axis=1)
-    points = np.einsum("nk,nka->na", weights, surface.corners[which])
-    return points, normal[which] / area[which, None], spacing
