@@ -24,6 +24,7 @@ from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.output.design import ArmView, gather_views
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.part.buckling import LeastBuckling, lowest_buckling
+from dolfinopt.part.domain import ANOTHER
 from dolfinopt.part.folder import scene_data, toml_text
 from dolfinopt.part.part import Meshes, Part, PartMesh
 from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
@@ -57,7 +58,7 @@ class Column:
     """What one form of the arms does.
 
     Attributes:
-        values: by the table's rows.
+        values, units: by the table's rows.
         objective: of the scene.
         stress: the largest, None where it is not known.
         stressed: name of the arm that has it.
@@ -67,6 +68,7 @@ class Column:
     """
 
     values: Mapping[str, float]
+    units: Mapping[str, str]
     objective: float
     stress: Peak | None
     stressed: str
@@ -232,28 +234,26 @@ def column_of(simulated: Simulated, peak: Peak | None, arm: str) -> Column:
             replace(limit, value=peak.value) if limit.quantity == STRESS else limit
             for limit in limits
         ]
-    values = dict(_values(simulated, float("nan") if peak is None else peak.value))
-    if not any(arm.is_solid for arm in simulated.scene.arms):  # one mesh is enough
-        values[BUCKLING] = float("nan")
-    return Column(
-        values, simulated.evaluation.objective, peak, arm, tuple(limits), simulated.trajectory
-    )
+    rows = list(_values(simulated, float("nan") if peak is None else peak.value))
+    values, units = {row[0]: row[1] for row in rows}, {row[0]: row[2] for row in rows}
+    evaluation, motion = simulated.evaluation, simulated.trajectory
+    return Column(values, units, evaluation.objective, peak, arm, tuple(limits), motion)
 
 
-def _values(simulated: Simulated, stress: float) -> Iterator[tuple[str, float]]:
-    """Yield the figures of a design, in the order of the table's rows."""
+def _values(simulated: Simulated, stress: float) -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, value and unit of the figures of a design, in the order of the table's rows."""
     scene, motion, result = simulated.scene, simulated.trajectory, simulated.evaluation
     bodies = motion.mechanism.bodies
     own = [k for k, owner in enumerate(scene.owners) if owner is not None]
-    yield "mass", sum(bodies[k].mass for k in own)
+    yield "mass", sum(bodies[k].mass for k in own), "kg"
     for k in own:
         if len(own) > 1:
-            yield f"mass_{scene.arms[k].name}", bodies[k].mass
+            yield f"mass_{scene.arms[k].name}", bodies[k].mass, "kg"
     for k in own:
         owner = scene.owners[k]
         assert owner is not None
         frequency = simulated.arms[owner].state(simulated.x_phys[owner]).first_frequency
-        yield f"first_frequency_{scene.arms[k].name}", frequency
+        yield f"first_frequency_{scene.arms[k].name}", frequency, "Hz"
     if scene.objective.response.name not in (
         "esl",
         "integral_compliance",
@@ -263,40 +263,25 @@ def _values(simulated: Simulated, stress: float) -> Iterator[tuple[str, float]]:
         "orientation",
         STRESS,
     ):
-        yield "objective", result.objective
-    yield "compliance", result.compliance
+        yield "objective", result.objective, scene.objective.response.unit
+    yield "compliance", result.compliance, "N m"
     if not scene.is_pinned:
-        yield "deviation", result.max_deviation
-        yield "settling", motion.settling
-    yield "orientation", motion.max_rotation
-    peak, _ = motion.drives
+        yield "deviation", result.max_deviation, "m"
+        yield "settling", motion.settling, "m"
+    yield "orientation", motion.max_rotation, "rad"
+    (peak, _), units = motion.drives, drive_units(scene)
     for name, value in zip(scene.driven, peak[scene.driven_columns], strict=True):
-        yield f"drive_peak_{name}", float(value)
+        yield f"drive_peak_{name}", float(value), units[name]
     for number, (other, figures) in enumerate(zip(motion.scenarios, result.scenarios), 1):
-        yield f"compliance_scenario_{number}", figures.compliance
+        yield f"compliance_scenario_{number}", figures.compliance, "N m"
         if not scene.is_pinned:
-            yield f"deviation_scenario_{number}", figures.max_deviation
-            yield f"settling_scenario_{number}", other.settling
+            yield f"deviation_scenario_{number}", figures.max_deviation, "m"
+            yield f"settling_scenario_{number}", other.settling, "m"
     for name, sizes in motion.closure_sizes.items():
-        yield f"closure_force_{name}", float(sizes["N"].max())
-    yield STRESS, stress
-
-
-def units_of(scene: Scene, column: Column) -> dict[str, str]:
-    """Return the unit of every row."""
-    known = {
-        "mass": "kg", "first_frequency": "Hz", "objective": scene.objective.response.unit,
-        "compliance": "N m", "deviation": "m", "settling": "m", "orientation": "rad",
-        "closure_force": "N",
-        STRESS: "Pa", BUCKLING: "-",
-    }  # fmt: skip
-    drives = {f"drive_peak_{name}": unit for name, unit in drive_units(scene).items()}
-    return {
-        row: drives[row]
-        if row in drives
-        else next(u for k, u in known.items() if row.startswith(k))
-        for row in column.values
-    }
+        yield f"closure_force_{name}", float(sizes["N"].max()), "N"
+    yield STRESS, stress, "Pa"
+    if not any(arm.is_solid for arm in scene.arms):  # one mesh is enough
+        yield BUCKLING, float("nan"), "-"
 
 
 def largest_of(peaks: Mapping[int, Peak], scene: Scene) -> tuple[Peak | None, str]:
@@ -311,7 +296,6 @@ def largest_of(peaks: Mapping[int, Peak], scene: Scene) -> tuple[Peak | None, st
 # leaves a third of it. Of stress more, but of the curved outlines of parts whose stress is limited.
 SETTLED, SETTLED_STRESS, SETTLED_LIMITED = 1.5e-2, 0.1, 2e-2
 SAFE = 1.5  # buckling factor below which the program warns
-LOST = 0.05  # compliance above that of the densities from which on parts are another design
 DENSITY, CRISP, PART, OPTIMISED = "density", "crisp", "part", "optimised part"
 
 
@@ -445,7 +429,7 @@ class Check:
         result = []
         softer = _ratio(self.part.values["compliance"], self.density.values["compliance"]) - 1.0
         aimed = self.before is not None and bool(self.part.limits)
-        if softer > LOST and not (aimed and all(limit.met for limit in self.part.limits)):
+        if softer > ANOTHER and not (aimed and all(limit.met for limit in self.part.limits)):
             result.append(
                 f"the machine with the parts is {100.0 * softer:.2g} % softer than with the "
                 "densities; see part.png, and make the design crisp (design.projection) or its "
@@ -634,7 +618,7 @@ def check_parts(
     worst, at = largest_of({place: item.everywhere for place, item in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value
     return Check(
-        units=units_of(scene, column),
+        units=column.units,
         density=density,
         crisp=crisp,
         part=column,

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 SAME = 2e-8  # distance from a line or circle, of the extent: Gmsh's points, files of eight digits
 SHARPEST = np.radians(40.0)  # turn from side to side up to which a polygon may stand for a curve
 FEWEST = 6  # points of an arc: a circle goes through any three
-STRAIGHT = 1e4  # radius of what is no circle, sizes of its points
-# Of the material, in grey cells: with 2 % a part is 4 % stiffer than the densities, as crisp ones.
-GREY_SHARE = 0.05
+# Share of the material in grey cells, or of the compliance, from which on parts are another design:
+# with 2 % of grey material a part is 4 % stiffer than the densities, as crisp ones.
+ANOTHER = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +152,7 @@ def _circle(points: np.ndarray, near: float, closed: bool = False) -> Arc | None
     if len(points) < (8 if closed else FEWEST):
         return None
     centre, radius, off = circle_through(points)
-    if off > near or not 0.0 < radius < STRAIGHT * np.ptp(points, axis=0).max():
+    if off > near or radius == 0.0:
         return None
     angle = np.arctan2(*(points - centre).T[::-1])
     steps = np.diff(np.append(angle, angle[0]) if closed else angle)
@@ -393,7 +393,7 @@ class Filled:
     @property
     def gray_words(self) -> list[str]:
         """What is said of a grey design."""
-        if self.gray_share <= GREY_SHARE:
+        if self.gray_share <= ANOTHER:
             return []
         return [
             f"arm {self.name!r}: grayness {self.grayness:.2g}: {100.0 * self.gray_share:.0f} % of "

@@ -24,14 +24,13 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
 from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, tetrahedra_of
 from dolfinopt.part.domain import INBOARD, OUTBOARD, ROUNDING, SolidDomain
-from dolfinopt.part.plane.curves import MM, Arc, Curve, Shape, Spline, curvature
+from dolfinopt.part.plane.curves import HALVINGS, MM, Arc, Curve, Shape, Spline, curvature, normals
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, with_volume
 
 if TYPE_CHECKING:
     from dolfinopt.part.plane.part import PlanePart
     from dolfinopt.part.solid.part import SolidPart
 
-CORNER = np.radians(10.0)  # turn of the outline from which on a joint of curves is a corner
 FOLDED = 1e-3  # shape of a cell, 1 where it is equilateral, below which it counts as folded
 
 
@@ -195,12 +194,6 @@ def outline_places(mesh: BodyMesh) -> tuple[np.ndarray, np.ndarray]:
     return mesh.sides[:, 0], places
 
 
-def normals(curve: Curve, t: np.ndarray) -> np.ndarray:
-    """Return the unit normals (n, 2) to the right, away from the material."""
-    d = curve.derivative(t)
-    return np.stack([d[:, 1], -d[:, 0]], axis=1) / np.linalg.norm(d, axis=1)[:, None]
-
-
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
@@ -211,7 +204,6 @@ PLATE_TURN = 0.9  # the same of plates in space, whose cells are as long as they
 LARGEST = 2.5  # side of a cell, cells of the design
 SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
-FINER = 4  # times that sides are halved until none cross each other
 SAMPLES = 0.3  # distance of places where sizes are looked at, cells of the design
 NEAREST = 48  # places around each that may be the other side of a member
 OPPOSED = -0.3  # cosine between the normals of both sides of a member, at most
@@ -240,10 +232,11 @@ def body_mesh(
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
     turn = FINE if finer is None else turn
     sizes = _sizes(shape, samples, cell, finer or (), turn)
-    for _ in range(FINER):
+    for _ in range(HALVINGS):
         outline = _outline(shape, samples, [coarser * size for size in sizes])
         if outline.is_simple:  # Gmsh would end the process
-            points, triangles = _triangulated(outline)
+            with gmsh_on_root(MPI.COMM_SELF) as gmsh:
+                points, triangles = _triangulated(gmsh, outline)
             mesh = BodyMesh(shape, points, triangles, outline.sides, outline.piece, outline.span)
             if not (fitted := mesh.fitted()).is_folded:
                 return fitted
@@ -376,13 +369,8 @@ def _divided(curve: Curve, t: np.ndarray, size: np.ndarray) -> tuple[np.ndarray,
     return at, np.interp(at[:-1], t, size)
 
 
-def _triangulated(outline: _Outline) -> tuple[np.ndarray, np.ndarray]:
+def _triangulated(gmsh: Any, outline: _Outline) -> tuple[np.ndarray, np.ndarray]:
     """Return points, those of the outline first and in its order, and triangles between them."""
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        return _by_gmsh(gmsh, outline)
-
-
-def _by_gmsh(gmsh: Any, outline: _Outline) -> tuple[np.ndarray, np.ndarray]:
     geo, corners = gmsh.model.geo, np.vstack(outline.loops)
     tags = [geo.addPoint(x, y, 0.0, h) for (x, y), h in zip(corners, outline.sizes, strict=True)]
     rings, first = [], 0
@@ -423,7 +411,6 @@ IN_CUBE = 8.5  # tetrahedra that fill a cube on one of their sides
 BESIDE = 0.1  # of a cell: distance of a facet's middle from a further interface that it belongs to
 SAME_VOLUME = 1e-4  # relative, of parts to designs, of meshes to parts
 ROUNDS = 10  # of moving less where cells would be spoilt, or a surface cross itself
-APART = 1e-6  # relative, of a mesh's volume to the part's
 
 
 def mesh_size(part: SolidPart) -> float:
@@ -548,9 +535,6 @@ def _of_volume(part: SolidPart, mesh: Tetrahedra) -> Tetrahedra:
     """Return a mesh whose points within the arm are moved a little, so that it has the volume."""
     # Flat facets cut off what is round. Points of cells that the move would spoil stay where they
     # are, and the others make up for them.
-    wanted = part.volume
-    if abs(mesh.volumes.sum() - wanted) <= APART * wanted:
-        return mesh
     facets, domain = mesh.boundary, part.domain
     free = np.zeros(len(mesh.points), dtype=bool)
     free[facets] = True
@@ -558,7 +542,7 @@ def _of_volume(part: SolidPart, mesh: Tetrahedra) -> Tetrahedra:
     rim = np.flatnonzero(free)
     free[rim] = distance_to_faces(mesh.points[rim], faces) > ROUNDING * domain.cell
     for _ in range(ROUNDS):
-        moved = with_volume(Surface(mesh.points, facets), free, wanted)
+        moved = with_volume(Surface(mesh.points, facets), free, part.volume)
         result = replace(mesh, points=moved.points)
         spoilt = (result.quality <= FOLDED) & (result.quality < mesh.quality)
         if not spoilt.any():

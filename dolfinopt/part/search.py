@@ -17,12 +17,12 @@ import numpy as np
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.plane.free_sides import FreeSides
+from dolfinopt.part.plane.limits import FAR
 from dolfinopt.part.plane.sides import BrokenError
 from dolfinopt.part.problem import NEAR, Place, Problem, State
 from dolfinopt.part.program import solve
 from dolfinopt.responses.constraints import EXCESS
 
-FAR = 0.6  # cells that a side's end, or a radius, moves in a step, at most
 FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.5, 2.0, 0.005  # of the trust region, of FAR
 FOLLOWED = 6  # steps that a mesh follows
 SETTLED = 1e-2  # relative fall of the objective on two new meshes that ends the search

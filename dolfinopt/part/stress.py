@@ -23,8 +23,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.fem.stress import LoadFields, stress_operator
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import facet_corners
-from dolfinopt.part.mesh import CORNER
-from dolfinopt.part.plane.curves import Shape, direction
+from dolfinopt.part.plane.curves import CORNER, Shape
 from dolfinopt.part.solid.surface import distance_to_faces
 from dolfinopt.responses.measured import NEGLIGIBLE_POWER_SHARE
 from dolfinopt.responses.products import Products, StressProduct
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
     from dolfinopt.scene.tables.objective import Objective
 
 HOT = 0.65  # of the largest stress, from which on a place is worth a finer mesh
-SHOWN = 0.999  # of the largest stress elsewhere, at singular points in pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +63,7 @@ class PartStress:
         everywhere: the largest of all, singular points included.
         hot: (n, d) where stress exceeds `HOT` times the peak, but at singular points, m.
         cells: for pictures: the largest at any corner of every cell, and when; at singular
-            points at most `SHOWN` times `peak`.
+            points at most `peak`.
     """
 
     peak: Peak
@@ -123,7 +121,7 @@ def _worst_of(
     whole = Peak(float(at[top]), tuple(map(float, points.places[top])), float(t[when[top]]))
     hot = points.places[counts & (at > HOT * best.value)]
     # What has no limit would be all that the colours show.
-    at[~counts] = np.minimum(at[~counts], SHOWN * best.value)
+    at[~counts] = np.minimum(at[~counts], best.value)
     worst = at[points.corners].argmax(axis=1)
     node = points.corners[np.arange(len(worst)), worst]
     return PartStress(best, whole, hot, ArmStress(best, whole, at[node], t[when[node]]))
@@ -288,14 +286,12 @@ CORNER_DISTANCE = np.sqrt(0.5)
 
 def singular_points(shape: Shape) -> np.ndarray:
     """Return re-entrant corners, and where interfaces end (n, 2), m."""
-    found = []
-    for loop in shape.loops:
-        for before, after in zip([loop[-1], *loop[:-1]], loop):
-            a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
-            turn = np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b)
-            if turn < -CORNER or before.label != after.label:
-                found.append(after.curve.start)
-    return np.array(found).reshape(-1, 2)
+    result = [
+        after.curve.start
+        for before, after, turn in shape.joints
+        if turn < -CORNER or before.label != after.label
+    ]
+    return np.array(result).reshape(-1, 2)
 
 
 def interface_lines(shape: Shape) -> Geometry:
@@ -336,7 +332,6 @@ def is_regular_in_plane(shape: Shape, cell: float, places: np.ndarray, margin: f
 # where its stress is known, is as far away.
 EDGE_DISTANCE = np.sqrt(0.75)
 REENTRANT_SINE = np.sin(np.radians(40.0))  # of the turn at a re-entrant edge
-SAMPLES = 4  # of an edge, for distances
 
 
 def is_regular_in_space(domain: SolidDomain, places: np.ndarray, margin: float) -> np.ndarray:
@@ -349,9 +344,7 @@ def is_regular_in_space(domain: SolidDomain, places: np.ndarray, margin: float) 
     """
     far = np.ones(len(places), dtype=bool)
     if len(edges := singular_edges(domain)):
-        share = np.linspace(0.0, 1.0, SAMPLES + 1)[:, None, None]
-        samples = ((1.0 - share) * edges[:, 0] + share * edges[:, 1]).reshape(-1, 3)
-        far = cKDTree(samples).query(places)[0] >= EDGE_DISTANCE * domain.cell
+        far = distance_to_faces(places, edges) >= EDGE_DISTANCE * domain.cell
     if margin > 0.0:
         for faces in (domain.inboard, domain.outboard):
             far &= distance_to_faces(places, faces) >= margin

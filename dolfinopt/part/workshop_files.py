@@ -65,16 +65,19 @@ def solid_text(shape: Shape, thickness: float, name: str, bottom: float = 0.0) -
 # -- STEP: curves ------------------------------------------------------------------------------
 
 
-def _edges(loop: Iterable[Piece]) -> list[tuple[Curve, str]]:
+def _edges(loop: tuple[Piece, ...]) -> list[tuple[Curve, str]]:
     """Return a loop's curves and their names: arcs below half a turn, splines by polynomials."""
-    return [(curve, piece.label) for piece in loop for curve in _portions(piece.curve)]
+    if _is_circle(loop):
+        return [(loop[0].curve, loop[0].label)]
+    return [(curve, piece.label) for piece in loop for curve in _divided(piece.curve)]
 
 
-def _portions(curve: Curve) -> list[Curve]:
+def _divided(curve: Curve) -> list[Curve]:
+    """Return the polynomials of a spline, or arcs below half a turn, which no format mistakes."""
     if isinstance(curve, Spline):
         knots = np.repeat([0.0, 1.0], DEGREE + 1)
         return [Spline(knots, points) for points in curve.bezier()]
-    if not isinstance(curve, Arc) or curve.is_circle or abs(curve.sweep) <= HALF:
+    if not isinstance(curve, Arc):
         return [curve]
     count = int(np.ceil(abs(curve.sweep) / HALF))
     part = curve.sweep / count
@@ -375,9 +378,8 @@ def _mm(point: np.ndarray) -> tuple[float, float]:
 def _corners(curve: Curve, tolerance: float) -> list[tuple[float, float, float]]:
     """Return corners of a polyline along a curve, without the last: x, y in mm, and bulge."""
     if isinstance(curve, Arc):
-        pieces = int(np.ceil(abs(curve.sweep) / np.pi))
-        places = curve.at(np.arange(pieces) / pieces)
-        return [(*_mm(p), float(np.tan(curve.sweep / pieces / 4.0))) for p in places]
+        arcs = [part for part in _divided(curve) if isinstance(part, Arc)]
+        return [(*_mm(arc.start), float(np.tan(arc.sweep / 4.0))) for arc in arcs]
     return [(*_mm(p), 0.0) for p in curve.at(curve.parameters(tolerance)[:-1])]
 
 
@@ -399,24 +401,15 @@ def svg_text(shape: Shape, title: str) -> str:
 def _path(loop: tuple[Piece, ...]) -> str:
     """Return the commands of a closed path, y downwards."""
     words = [f"M {_xy(loop[0].curve.start)}"]
-    for piece in loop:
-        curve = piece.curve
+    for curve in (part for piece in loop for part in _divided(piece.curve)):
         if isinstance(curve, Line):
             words.append(f"L {_xy(curve.end)}")
         elif isinstance(curve, Arc):
-            words += _svg_arcs(curve)
+            radius, side = f"{MM * curve.radius:.12g}", int(curve.sweep < 0.0)
+            words.append(f"A {radius} {radius} 0 0 {side} {_xy(curve.end)}")
         else:
-            for _, b, c, d in curve.bezier():
-                words.append(f"C {_xy(b)} {_xy(c)} {_xy(d)}")
+            words.append(f"C {' '.join(map(_xy, curve.points[1:]))}")
     return " ".join([*words, "Z"])
-
-
-def _svg_arcs(arc: Arc) -> list[str]:
-    """Return an arc in pieces of half a turn at most, which the format cannot mistake."""
-    pieces = int(np.ceil(abs(arc.sweep) / np.pi - 1e-9))
-    radius, side = f"{MM * arc.radius:.12g}", int(arc.sweep < 0.0)
-    places = arc.at(np.arange(1, pieces + 1) / pieces)
-    return [f"A {radius} {radius} 0 0 {side} {_xy(p)}" for p in places]
 
 
 def _xy(point: np.ndarray) -> str:
@@ -450,10 +443,8 @@ def extruded_facets(loops: list[np.ndarray], thickness: float) -> np.ndarray:
     loops = [_rounded(loop) for loop in loops]
     polygon = shapely.Polygon(loops[0], loops[1:])
     triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+    triangles = shapely.orient_polygons(triangles)
     flat = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3]
-    twice = (flat[:, 1, 0] - flat[:, 0, 0]) * (flat[:, 2, 1] - flat[:, 0, 1])
-    twice -= (flat[:, 2, 0] - flat[:, 0, 0]) * (flat[:, 1, 1] - flat[:, 0, 1])
-    flat[twice < 0.0] = flat[twice < 0.0][:, ::-1]
     top, bottom = _lifted(flat, thickness), _lifted(flat[:, ::-1], 0.0)
     walls = []
     for loop in loops:

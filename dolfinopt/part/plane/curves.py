@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,11 +10,12 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 DEGREE = 3
+HALVINGS = 4  # of lengths, at most, until no curves and sides cross
 MM = 1e3  # of a metre
 # Gauss points on [0, 1], exact for the area under a cubic and, to rounding, for arcs.
 GAUSS, WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(12), (1.0, 0.0)))
 MIRROR = np.array([1.0, -1.0])
-KINK = np.radians(1.0)  # turn of the outline at a joint from which on it is a corner
+CORNER = np.radians(10.0)  # turn of the outline at a joint from which on it is a corner
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,6 +256,17 @@ def direction(curve: Curve, t: float) -> np.ndarray:
     return np.asarray(d / np.linalg.norm(d))
 
 
+def normals(curve: Curve, t: np.ndarray) -> np.ndarray:
+    """Return the unit normals (n, 2) to the right, away from the material."""
+    d = curve.derivative(t)
+    return np.stack([d[:, 1], -d[:, 0]], axis=1) / np.linalg.norm(d, axis=1)[:, None]
+
+
+def turn_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the angle from one vector (2,) to another, positive to the left, rad."""
+    return float(np.arctan2(_cross(a, b), a @ b))
+
+
 def _inside(ends: np.ndarray) -> np.ndarray:
     """Return both ends of every piece, a hair inside: where a derivative may jump."""
     hair = 1e-9 * np.diff(ends)
@@ -331,15 +344,22 @@ class Shape:
         """Area within the outer loop less that of the holes, m2."""
         return sum(curve.area for curve in self.curves)
 
+    @property
+    def joints(self) -> Iterator[tuple[Piece, Piece, float]]:
+        """Pieces that follow one another, and by how much the outline turns between them, rad."""
+        for loop in self.loops:
+            for before, after in zip((loop[-1], *loop[:-1]), loop):
+                ends = direction(before.curve, 1.0), direction(after.curve, 0.0)
+                yield before, after, turn_between(*ends)
+
     @cached_property
     def concave(self) -> list[Concave]:
         """Its concave corners, arcs and splines."""
-        result = []
-        for loop in self.loops:
-            for before, after in zip((loop[-1], *loop[:-1]), loop):
-                a, b = direction(before.curve, 1.0), direction(after.curve, 0.0)
-                if _cross(a, b) < -np.sin(KINK):
-                    result.append(Concave(after.curve.start, 0.0, before.free or after.free))
+        result = [
+            Concave(after.curve.start, 0.0, before.free or after.free)
+            for before, after, turn in self.joints
+            if turn < -CORNER
+        ]
         for piece in self.pieces:
             t = np.linspace(0.0, 1.0, 33)
             bend = curvature(piece.curve, t)

@@ -20,7 +20,16 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Edge
-from dolfinopt.part.plane.curves import MIRROR, Arc, Curve, Line, Piece, circle_through
+from dolfinopt.part.plane.curves import (
+    HALVINGS,
+    MIRROR,
+    Arc,
+    Curve,
+    Line,
+    Piece,
+    circle_through,
+    turn_between,
+)
 from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, SHORT, TURN, Limits
 from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.sides import (
@@ -33,13 +42,11 @@ from dolfinopt.part.plane.sides import (
     angle_of,
     left,
     meet,
-    turn_between,
     unit,
 )
 
 LEAST = 0.4  # length of a side that is worth drawing, cells
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
-FINER = 4  # times that a tolerance is halved: of a contour, and then of all
 REACH = 3.0  # cells from the ends of two sides within which they meet
 STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
 ROOM = 0.5  # share of a side that a fillet at one of its ends may take
@@ -101,7 +108,7 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
-    for halvings in range(FINER):
+    for halvings in range(HALVINGS):
         whole = _drawn(outline, limits, 0.5**halvings * tolerance)
         with suppress(BrokenError):
             made = limits.nearest(whole, area=area) or limits.nearest(whole)
@@ -118,7 +125,7 @@ def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
     pen = _Pen(outline, limits, counting())
     contours = list(_contours(outline, tolerance, np.pi * limits.tool**2))
     drawn = {k: pen.drawn(item, tolerance) for k, item in enumerate(contours)}
-    for halvings in range(1, FINER + 1):
+    for halvings in range(1, HALVINGS + 1):
         for k in _spoilt(drawn, contours, outline, tolerance):
             drawn[k] = pen.drawn(contours[k], 0.5**halvings * tolerance) or drawn[k]
     return _joined(drawn.values())

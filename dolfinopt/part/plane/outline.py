@@ -17,30 +17,24 @@ from scipy.optimize import brentq
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
-from dolfinopt.part.plane.limits import CHORD, Limits, interfaces
+from dolfinopt.part.plane.limits import CHORD, LINK, Limits, interfaces
 
 if TYPE_CHECKING:
     from shapely import Geometry, Polygon
 
 
-SAMPLES = 5  # points of the raster in a cell
+SAMPLES = 5  # points of the raster in a cell; beyond the arm on every side
 MOST = 1_500_000  # points of a raster
-MARGIN = 4  # points beyond the arm on every side
 # Width of the Gaussian, in cells, that turns the steps of a projected design into slopes. A strut
 # of one cell keeps 0.595 of its density in its middle; from 0.75 on it would fall below one half.
 BLUR = 0.6
-AREA = 1e-3  # relative: up to which the level is sought; sides make up for the rest
+AREA = 1e-3  # relative: up to which the level is sought, and a density has no outline
 LEAP = 0.05  # relative: what sides make up for where a piece joins or leaves at one level
 TOOL, SLIM = 3e-3, 0.1  # default radius of the tool, m; of the arm's height, at most
-# Least width of members, in cells, also of those that the design has and the level has not: solid
-# cells that share a corner are joined in the finite elements. Without them a light arm has 12 holes
-# of 17, and the search from there ends 10 % heavier.
-LINK = 0.5
 # Width of members that go where they end nowhere, cells: with neither this nor wider necks a rod
 # has no sides within a cell, and a plate with bores twice as many, 403 kB of STEP for 214.
 STUB = 1.5
-UNIFORM = 1e-3  # range of a density without outline
-SMALLEST_STUB = 0.25  # area of a member that ends nowhere, at least, squared widths
+SMALLEST = 0.25  # area of a neck, or of a member that ends nowhere, at least, squared widths
 
 
 def polygons_of(geometry: Geometry) -> list[Polygon]:
@@ -95,7 +89,7 @@ def rasterise(domain: Domain) -> Raster:
     counts = np.ceil((high - low) / step).astype(int)
     size = (high - low) / counts
     x, y = (
-        low[k] + size[k] * np.arange(-MARGIN, counts[k] + MARGIN + 1, dtype=float) for k in (0, 1)
+        low[k] + size[k] * np.arange(-SAMPLES, counts[k] + SAMPLES + 1, dtype=float) for k in (0, 1)
     )
     if domain.symmetric:
         y = 0.5 * (y - y[::-1])
@@ -194,7 +188,7 @@ def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
         )
     if volume > limits.arm.area * (1.0 - AREA):
         return Outline(domain, max(polygons_of(limits.arm), key=lambda p: p.area), 0.0, tool)
-    if float(np.ptp(domain.field)) < UNIFORM:
+    if float(np.ptp(domain.field)) < AREA:
         raise InputError(
             f"{where}: its density is {domain.field.mean():.3g} everywhere, which has no outline; "
             "optimise it first"
@@ -246,7 +240,7 @@ def _narrow(whole: Geometry, width: float, near: float) -> tuple[np.ndarray, np.
 
     wide = whole.buffer(-0.5 * width).buffer(0.5 * width + near)
     pieces = shapely.get_parts(whole.difference(wide))
-    pieces = shapely.buffer(pieces[shapely.area(pieces) > 0.01 * width**2], 3.0 * near)
+    pieces = shapely.buffer(pieces[shapely.area(pieces) > SMALLEST * width**2], 3.0 * near)
     joined = [len(polygons_of(item)) for item in shapely.intersection(pieces, wide)]
     return pieces, np.array(joined, dtype=int)
 
@@ -282,9 +276,9 @@ def _without_stubs(polygon: Polygon, stays: Geometry, width: float, near: float)
 
     while not polygon.is_empty:
         narrow, joined = _narrow(polygon, width, near)
-        stubs = narrow[(joined == 1) & (shapely.area(narrow) > SMALLEST_STUB * width**2)]
+        stubs = narrow[joined == 1]
         left = polygon.difference(shapely.union_all(stubs)).union(stays.intersection(polygon))
         before, polygon = polygon.area, max(polygons_of(left), key=lambda item: item.area)
-        if polygon.area > before - SMALLEST_STUB * width**2:
+        if polygon.area > before - SMALLEST * width**2:
             break
     return polygon

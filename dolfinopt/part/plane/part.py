@@ -13,11 +13,18 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
-from dolfinopt.part.mesh import BodyMesh, body_mesh
+from dolfinopt.part.mesh import SAME_VOLUME, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import MM, Concave, Shape
 from dolfinopt.part.plane.fit import distance, fitted_sides
-from dolfinopt.part.plane.limits import THIN, limits_of_part, rounded_radii, thinnest_member
+from dolfinopt.part.plane.limits import (
+    KEPT,
+    NARROW,
+    THIN,
+    limits_of_part,
+    rounded_radii,
+    thinnest_member,
+)
 from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
 from dolfinopt.part.plane.sides import Sides
 from dolfinopt.part.stress import corner_stress, is_regular_in_plane
@@ -37,10 +44,8 @@ if TYPE_CHECKING:
 
 
 TOLD = 5  # tight places that a sentence names
-ENOUGH = 0.98  # of the tool's radius, below which it does not reach a place
-SAME_AREA, QUARTERS = 1e-4, 6  # relative, of chords to their curves; of the chords' distance
+QUARTERS = 6  # of the chords' distance, at most, for the volume within them
 TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
-AWAY = 1.0  # cells that sides may lie from the outline by default
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +91,7 @@ class PlanePart:
     @cached_property
     def tight(self) -> list[Concave]:
         """Concave corners and curves that the tool does not reach."""
-        least = ENOUGH * self.outline.tool_radius
+        least = self.outline.tool_radius - KEPT
         result = [item for item in self.shape.concave if item.radius < least]
         return sorted(result, key=attrgetter("radius"))
 
@@ -136,7 +141,7 @@ class PlanePart:
                 f"arm {domain.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
             )
         least = domain.minimum_member or THIN
-        if self.thinnest is not None and self.thinnest < 0.9 * least:
+        if self.thinnest is not None and self.thinnest < NARROW * least:
             result.append(
                 f"arm {domain.name!r}: its thinnest neck is {MM * self.thinnest:.3g} mm wide, "
                 f"below the smallest that is asked for, {MM * least:.3g} mm"
@@ -213,7 +218,7 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
     for _ in range(QUARTERS):
         loops = shape.polygons(chord)
         area = sum(0.5 * np.cross(loop, np.roll(loop, -1, axis=0)).sum() for loop in loops)
-        if abs(area - shape.area) <= SAME_AREA * shape.area:
+        if abs(area - shape.area) <= SAME_VOLUME * shape.area:
             break
         chord *= 0.25  # sides half as long
     return extruded_facets(loops, thickness)
@@ -221,7 +226,7 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
 
 def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
     """Return the part of one arm, see `part.make_parts`."""
-    away = AWAY * domain.cell if curves.tolerance is None else curves.tolerance
+    away = domain.cell if curves.tolerance is None else curves.tolerance
     if away > domain.cell:
         raise InputError(
             f"--tolerance = {away:g} m: expected at most a cell of arm {domain.name!r}, "
@@ -242,7 +247,7 @@ def fuller(part: PlanePart, more: float) -> PlanePart:
     domain, tool = part.domain, part.outline.tool_radius
     limits = limits_of_part(domain, tool)
     outline = draw_outline(domain, limits, more)
-    sides = fitted_sides(outline, limits, AWAY * domain.cell, outline.area)
+    sides = fitted_sides(outline, limits, domain.cell, outline.area)
     return replace(part, outline=outline, sides=sides)
 
 

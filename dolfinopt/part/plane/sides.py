@@ -18,7 +18,7 @@ with t_i along side i, n'_i its normal turned by a right angle and m_i the middl
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -38,6 +38,7 @@ from dolfinopt.part.plane.curves import (
     curvature,
     direction,
     projected,
+    turn_between,
 )
 
 PARALLEL = 1e-4  # sine of the angle between two sides below which they do not meet
@@ -62,11 +63,6 @@ def left(v: np.ndarray) -> np.ndarray:
 def angle_of(v: np.ndarray) -> float:
     """Return the angle of a vector (2,), rad."""
     return float(np.arctan2(v[1], v[0]))
-
-
-def turn_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the angle from one vector (2,) to another, positive to the left, rad."""
-    return float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b))
 
 
 @dataclass(frozen=True, eq=False)
@@ -477,26 +473,27 @@ class Sides:
     def ties(self) -> np.ndarray:
         """T (n, count) with q = T x; x are lengths, of turns the move of a side's end, m."""
         count, sides, corners = self.numbers
+        image, sign = np.arange(count), np.ones(count)
         at = {self.loops[i].sides[k].key: j for (i, k), j in sides.items()}
-        pairs: list[tuple[int, int, float]] = []
         for (i, k), j in sides.items():
-            twin = self.loops[i].sides[k].twin
-            if twin in at:
-                pairs += [(j, at[twin], 1.0), (j + 1, at[twin] + 1, -1.0)]
+            if (twin := at.get(self.loops[i].sides[k].twin)) is not None:
+                image[j : j + 2], sign[j + 1] = (twin, twin + 1), -1.0
         ends = {self._beside(i, k): j for (i, k), j in corners.items()}
         for (i, k), j in corners.items():
-            image = self._beside(i, k, twins=True)
-            if image in ends:
-                pairs.append((j, ends[image], 1.0))
+            image[j] = ends.get(self._beside(i, k, twins=True), j)
         rings = {circle.key: self.of_circles + 3 * k for k, circle in enumerate(self.circles)}
-        for circle in self.circles:
-            if circle.twin in rings:
-                j, twin = rings[circle.key], rings[circle.twin]
-                pairs += [(j, twin, 1.0), (j + 1, twin + 1, -1.0), (j + 2, twin + 2, 1.0)]
-        held: list[int] = []
+        for k, circle in enumerate(self.circles):
+            if (twin := rings.get(circle.twin)) is not None:
+                j = self.of_circles + 3 * k
+                image[j : j + 3], sign[j + 1] = twin + np.arange(3), -1.0
+        first = np.minimum(image, np.arange(count))
+        held = (image == np.arange(count)) & (sign < 0.0)
         if self.holds_radii:
-            held = [*corners.values(), *range(self.of_circles + 2, count, 3)]
-        T = _tied(count, pairs, held)
+            held[[*corners.values(), *range(self.of_circles + 2, count, 3)]] = True
+        rows = np.flatnonzero(~held)
+        names, column = np.unique(first[rows], return_inverse=True)
+        T = np.zeros((count, len(names)))
+        T[rows, column] = np.where(rows == names[column], 1.0, sign[rows])
         half = np.ones(count)
         for key, j in sides.items():
             half[j + 1] = 0.5 * self.lengths[key]
@@ -563,25 +560,3 @@ def between(curve: Curve, start: np.ndarray, end: np.ndarray) -> Curve:
     if b - a < 1e-9:
         raise BrokenError("a curve of the arm's own vanishes between two corners")
     return curve.part(a, b)
-
-
-def _tied(
-    count: int, pairs: Sequence[tuple[int, int, float]], held: Sequence[int] = ()
-) -> np.ndarray:
-    """Return T (count, m) with one column for each group of variables that are tied with a sign."""
-    group, sign = np.arange(count), np.ones(count)
-    zero = np.zeros(count, dtype=bool)
-    zero[list(held)] = True
-    for a, b, same in pairs:
-        if group[a] != group[b]:
-            joins = group == group[b]
-            sign[joins] *= sign[a] * sign[b] * same
-            group[joins] = group[a]
-        elif sign[a] * sign[b] != same:
-            zero[group == group[a]] = True
-    gone = np.isin(group, group[zero])
-    names = np.unique(group[~gone])
-    T = np.zeros((count, len(names)))
-    rows = np.flatnonzero(~gone)
-    T[rows, np.searchsorted(names, group[rows])] = sign[rows]
-    return T

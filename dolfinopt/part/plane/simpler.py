@@ -11,9 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from dolfinopt.part.plane.curves import turn_between
 from dolfinopt.part.plane.fit import Drawn, cleaned, looped, without
 from dolfinopt.part.plane.limits import SHORT, TURN, Limits
-from dolfinopt.part.plane.sides import Sides, turn_between, unit
+from dolfinopt.part.plane.sides import Sides, unit
 
 NEARLY = 1.2  # of the least turn, up to which a corner hardly turns
 VANISHING = 2.5  # of the least length, up to which a side vanishes

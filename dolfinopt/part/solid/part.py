@@ -18,6 +18,7 @@ from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import ROUNDS, SAME_VOLUME, mesh_size, solid_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import MM, Shape
+from dolfinopt.part.plane.limits import NARROW
 from dolfinopt.part.plane.part import PlanePart, make_part, shape_facets
 from dolfinopt.part.solid.surface import (
     WHOLE,
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
 FURTHEST = 0.5  # cells that a point of the part may be from where the isosurface has it
 LEAST_SHARE = 0.2  # of the smoothing that is left, below which all of it is taken back
 HELD = 0.9  # of the mark of what stays solid, from which on points belong to its faces
-NARROW = 0.9  # of the width asked for, below which a member or gap is told
 
 
 @dataclass(frozen=True, eq=False)

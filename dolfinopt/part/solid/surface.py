@@ -23,7 +23,6 @@ from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.plane.curves import MM
 
-BELOW = 0.98  # the highest level, over the highest density
 APART = 0.005  # least difference of a node's density from the level
 # Corners of a hexahedron, from a tensor product's order to VTK's.
 AROUND = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
@@ -156,33 +155,25 @@ def eighths(nodes: np.ndarray) -> np.ndarray:
     return np.stack(parts, axis=1).reshape(-1, 8)
 
 
-def forty_eighths(nodes: np.ndarray) -> np.ndarray:
-    """Return the nodes (48 n, 4) of the tetrahedra that `halved` can be cut in, from (n, 27).
+def tetrahedra(points: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes (k, 4) of tetrahedra in which hexahedra of nodes (n, 8) are cut.
 
-    Each has the centre of the cell, of a face, of an edge, and a corner. Neighbours cut a face they
-    share alike, however they are turned, as VTK's ways to clip hexahedra do not.
+    By the numbers of the nodes: neighbours cut a face that they share alike, however they are
+    turned, as VTK's ways to clip hexahedra do not.
     """
-    return nodes[:, FORTY_EIGHTHS].reshape(-1, 4)
+    import pyvista
+
+    cells = _grid(points, nodes).triangulate().cells_dict[pyvista.CellType.TETRA]
+    return _right_handed(points[cells], cells)
 
 
-def _forty_eighths() -> np.ndarray:
-    """Return the rows (48, 4) of `forty_eighths`, of positive volume."""
-    places = np.array([[x, y, z] for z in (0, 1, 2) for y in (0, 1, 2) for x in (0, 1, 2)])
-    result = []
-    odd = (places != 1).sum(axis=1)  # of a corner 3, of an edge 2, of a face 1, of the centre 0
-    for face in np.flatnonzero(odd == 1):
-        for edge in np.flatnonzero(odd == 2):
-            for corner in np.flatnonzero(odd == 3):
-                steps = places[[face, edge, corner]] - 1
-                if ((steps[0] == 0) | (steps[0] == steps[1])).all() and (
-                    (steps[1] == 0) | (steps[1] == steps[2])
-                ).all():
-                    turned = np.linalg.det(steps) < 0.0
-                    result.append([13, face, *((corner, edge) if turned else (edge, corner))])
-    return np.array(result)
+def _grid(points: np.ndarray, nodes: np.ndarray) -> Any:
+    """Return the grid, of VTK, of cells of nodes (n, 4 or 8)."""
+    import pyvista
 
-
-FORTY_EIGHTHS = _forty_eighths()
+    count = nodes.shape[1]
+    kind = pyvista.CellType.TETRA if count == 4 else pyvista.CellType.HEXAHEDRON
+    return pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
 
 
 def _centre_faces(grid: np.ndarray, corners: np.ndarray, axis: int) -> None:
@@ -235,11 +226,7 @@ def cut(
         level: of the density.
         fields: (n, ...) further values at the nodes that the grid is to have, by their names.
     """
-    import pyvista
-
-    count = nodes.shape[1]
-    kind = pyvista.CellType.TETRA if count == 4 else pyvista.CellType.HEXAHEDRON
-    grid = pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
+    grid = _grid(points, nodes)
     # Through a node or next to it triangles would have no size, and corners fall together.
     grid.point_data["density"] = np.where(np.abs(values - level) < APART, level + APART, values)
     for name, field_values in (fields or {}).items():
@@ -345,17 +332,19 @@ def smooth_surface(
 
 
 def distance_to_faces(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Return the distance (n,) of points (n, 3) from the nearest of faces (k, 3 or 4, 3), m.
+    """Return the distance (n,) of points (n, 3) from the nearest of faces (k, 2 to 4, 3), m.
 
     Args:
         points: m.
-        faces: corners around flat faces, m.
+        faces: corners around flat faces, or ends of edges, m.
     """
     import pyvista
 
-    corners = faces.reshape(-1, 3)
-    around = np.arange(len(corners), dtype=int).reshape(faces.shape[:2])
-    result = pyvista.PolyData.from_regular_faces(corners, around)
+    corners, count = faces.reshape(-1, 3), faces.shape[1]
+    around = np.arange(len(corners), dtype=int).reshape(-1, count)
+    cells = np.column_stack([np.full(len(around), count), around]).ravel()
+    mesh: Any = pyvista.PolyData
+    result = mesh(corners, lines=cells) if count == 2 else mesh(corners, cells)
     _, nearest = result.find_closest_cell(points, return_closest_point=True)
     return np.asarray(np.linalg.norm(np.asarray(nearest) - points, axis=1))
 
@@ -527,7 +516,7 @@ def _field(domain: SolidDomain) -> _Field:
     is_box = domain.is_box
     if corners.shape[1] == 8 and (len(corners) <= FEW or not is_box):
         points, nodes, values = halved(corners, density)
-        cells = eighths(nodes) if is_box else forty_eighths(nodes)
+        cells = eighths(nodes) if is_box else tetrahedra(points, eighths(nodes))
         faces = {name: middles(face) for name, face in faces.items()}
     else:
         points, nodes, values = nodal_densities(corners, density)
@@ -553,7 +542,7 @@ def at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:
         return 0.0 if abs(off) <= NEAR * target else off
 
     with suppress(ValueError):  # whatever the level the volume is too large, or too small
-        brentq(excess, APART, BELOW * float(field.values.max()), xtol=FINE)
+        brentq(excess, APART, float(field.values.max()) - APART, xtol=FINE)
     if not tried:
         raise InputError(
             f"arm {domain.name!r}: its design does not hang together: no material joins both "
