@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -252,19 +253,18 @@ class Problem:
         share = self.scene.design.volume_fraction
         if share is None:
             return []
-        sizes, most, slopes, first = [], [], [], 0
-        count = sum(outline.count for outline in outlines.values())
-        for outline in outlines.values():
-            domain, row = outline.part.domain, np.zeros(count)
-            row[first : first + outline.count] = domain.thickness * outline.area_by_x()
-            first += outline.count
-            sizes.append(domain.thickness * outline.sides.shape.area)
+        ends, rows = np.cumsum([0, *(outline.count for outline in outlines.values())]), []
+        for outline, (first, last) in zip(outlines.values(), pairwise(ends), strict=True):
+            domain, slope = outline.part.domain, np.zeros(ends[-1])
+            slope[first:last] = outline.area_by_x()
             # What the densities have: sides may have begun a little above the limit.
-            most.append(domain.thickness * max(share * domain.whole, domain.volume))
-            slopes.append(row)
+            most = max(share * domain.whole, domain.volume)
+            t = domain.thickness
+            rows.append((t * outline.sides.shape.area, t * most, t * slope))
         if self.scene.design.shared_volume:
-            sizes, most, slopes = [sum(sizes)], [sum(most)], [np.sum(slopes, axis=0)]
-        return [(s / m - 1.0, row / m) for s, m, row in zip(sizes, most, slopes, strict=True)]
+            sizes, limits, slopes = zip(*rows, strict=True)
+            rows = [(sum(sizes), sum(limits), np.sum(slopes, axis=0))]
+        return [(size / most - 1.0, slope / most) for size, most, slope in rows]
 
     def slopes(self, state: State) -> np.ndarray:
         """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""

@@ -24,7 +24,8 @@ from dolfinopt.fem.stress import LoadFields, stress_operator
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.checks import facet_corners
 from dolfinopt.part.plane.curves import CORNER, Shape
-from dolfinopt.part.solid.surface import distance_to_faces
+from dolfinopt.part.plane.limits import interfaces
+from dolfinopt.part.solid.surface import distance_to_faces, neighbours
 from dolfinopt.responses.measured import NEGLIGIBLE_POWER_SHARE
 from dolfinopt.responses.products import Products, StressProduct
 from dolfinopt.responses.stress import (
@@ -40,13 +41,11 @@ from dolfinopt.responses.stress import (
 from dolfinopt.responses.stress_report import ArmStress, Peak
 
 if TYPE_CHECKING:
-    from shapely import Geometry
-
     from dolfinopt.arms.arm import Arm
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.fem.stress import LoadFields
-    from dolfinopt.part.domain import SolidDomain
+    from dolfinopt.part.domain import Domain, SolidDomain
     from dolfinopt.part.part import Part
     from dolfinopt.responses.response import Analysis
     from dolfinopt.scene.tables.objective import Objective
@@ -294,22 +293,14 @@ def singular_points(shape: Shape) -> np.ndarray:
     return np.array(result).reshape(-1, 2)
 
 
-def interface_lines(shape: Shape) -> Geometry:
-    """Return the curves of both interfaces as polylines (shapely)."""
-    import shapely
-
-    t = np.linspace(0.0, 1.0, 65)
-    return shapely.union_all(
-        [shapely.LineString(piece.curve.at(t)) for piece in shape.pieces if piece.label]
-    )
-
-
-def is_regular_in_plane(shape: Shape, cell: float, places: np.ndarray, margin: float) -> np.ndarray:
+def is_regular_in_plane(
+    shape: Shape, domain: Domain, places: np.ndarray, margin: float
+) -> np.ndarray:
     """Return which places (n, 2) are away from singular points and interfaces (n,).
 
     Args:
         shape: of the part, m.
-        cell: size of the design's cells, m.
+        domain: the arm.
         places: m.
         margin: from the interfaces, m.
     """
@@ -318,10 +309,10 @@ def is_regular_in_plane(shape: Shape, cell: float, places: np.ndarray, margin: f
     far = np.ones(len(places), dtype=bool)
     if len(singular := singular_points(shape)):
         gaps = np.linalg.norm(places[:, None] - singular, axis=2)
-        far = gaps.min(axis=1) >= CORNER_DISTANCE * cell
+        far = gaps.min(axis=1) >= CORNER_DISTANCE * domain.cell
     if margin > 0.0:
         at = shapely.points(places)
-        far &= shapely.distance(at, interface_lines(shape)) >= margin
+        far &= shapely.distance(at, shapely.union_all(interfaces(domain))) >= margin
     return far
 
 
@@ -354,23 +345,17 @@ def is_regular_in_space(domain: SolidDomain, places: np.ndarray, margin: float) 
 def singular_edges(domain: SolidDomain) -> np.ndarray:
     """Return the edges (n, 2, 3), m, around interfaces and re-entrant ones of the arm's faces."""
     faces = domain.own
-    count = faces.shape[1]
     points, nodes = np.unique(faces.reshape(-1, 3), axis=0, return_inverse=True)
-    nodes = nodes.reshape(-1, count)
+    nodes = nodes.reshape(faces.shape[:2])
     centre, normal = faces.mean(axis=1), domain.outward
     kind = np.zeros(len(faces), dtype=int)
     for value, some in ((1, domain.inboard), (2, domain.outboard)):
         kind[cKDTree(some.mean(axis=1)).query(centre)[0] < 1e-9 * domain.cell] = value
-    ends = np.stack([nodes, np.roll(nodes, -1, axis=1)], axis=2).reshape(-1, 2)
-    face = np.repeat(np.arange(len(faces)), count)
-    key = np.sort(ends, axis=1) @ [len(points), 1]
-    order = np.argsort(key, kind="stable")
-    pair = np.flatnonzero(key[order][1:] == key[order][:-1])
-    one, other = face[order[pair]], face[order[pair + 1]]
+    edges, pairs = neighbours(nodes)
+    one, other = pairs.T
     # Re-entrant: the neighbour rises above the plane of the face.
     rise = (normal[one] * (centre[other] - centre[one])).sum(axis=1)
     turn = np.linalg.norm(np.cross(normal[one], normal[other]), axis=1)
     size = np.linalg.norm(centre[other] - centre[one], axis=1)
     sharp = (turn > REENTRANT_SINE) & (rise > 0.1 * size)
-    found = ends[order[pair]][sharp | (kind[one] != kind[other])]
-    return np.asarray(points[found])
+    return np.asarray(points[edges[sharp | (kind[one] != kind[other]), 0]])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import BodyMesh, PlateMesh, extruded
-from dolfinopt.part.plane.curves import Line
+from dolfinopt.part.plane.curves import Curve, Line
 from dolfinopt.part.plane.limits import Limits
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import (
@@ -181,41 +180,50 @@ class FreeSides:
     @property
     def arrays(self) -> dict[str, np.ndarray]:
         """What `restored` makes it of."""
-        edges = self.part.domain.edges
-        rows, corners, sizes = [], [], []
-        for loop in self.sides.loops:
-            sizes.append(len(loop.sides))
-            for side, corner in zip(loop.sides, loop.corners, strict=True):
-                turned = side.edge >= 0 and side.curve is not edges[side.edge].curve
-                numbers = side.edge, turned, side.key, side.twin
-                rows.append([*side.point, side.angle, *map(float, numbers)])
-                corners.append([*corner.place, corner.radius])
-        circles = [
-            [*circle.centre, circle.radius, circle.key, circle.twin]
-            for circle in self.sides.circles
+        rows = [
+            np.hstack(
+                [
+                    (i, side.edge, self._way(side), side.key, side.twin, side.angle, corner.radius),
+                    side.point,
+                    corner.place,
+                ]
+            )
+            for i, loop in enumerate(self.sides.loops)
+            for side, corner in zip(loop.sides, loop.corners, strict=True)
         ]
-        return {
-            "sides": np.array(rows), "corners": np.array(corners), "sizes": np.array(sizes),
-            "circles": np.array(circles).reshape(-1, 5),
-        }  # fmt: skip
+        circles = [[ring.key, ring.twin, *ring.centre, ring.radius] for ring in self.sides.circles]
+        return {"sides": np.array(rows), "circles": np.array(circles).reshape(-1, 5)}
+
+    def _way(self, side: Side) -> int:
+        """Return which of `_ways` of the arm's own curve a side is."""
+        if side.curve is None:
+            return 0
+        t = np.array([0.0, 0.25, 1.0])
+        ways = _ways(self.part.domain.edges[side.edge].curve)
+        return int(np.argmin([np.abs(way.at(t) - side.curve.at(t)).max() for way in ways]))
 
     def restored(self, arrays: Mapping[str, np.ndarray]) -> FreeSides:
         """Return the sides of these `arrays`, of those that these have become."""
-        edges = self.part.domain.edges
-        sides, corners = [], [Corner(row[:2], float(row[2])) for row in arrays["corners"]]
-        for x, y, angle, edge, turned, key, twin in arrays["sides"]:
-            own = edges[int(edge)] if edge >= 0 else None
-            curve = None if own is None else own.curve.reversed() if turned else own.curve
-            label = "" if own is None else own.label
-            names = int(edge), int(key), int(twin)
-            sides.append(Side(np.array([x, y]), float(angle), curve, label, *names))
-        ends = np.cumsum([0, *arrays["sizes"]])
-        loops = [Loop(tuple(sides[a:b]), tuple(corners[a:b])) for a, b in pairwise(ends)]
+        loops = []
+        for i in np.unique(arrays["sides"][:, 0]):
+            sides, corners = [], []
+            for row in arrays["sides"][arrays["sides"][:, 0] == i]:
+                edge, way, key, twin = map(int, row[1:5])
+                own = self.part.domain.edges[edge] if edge >= 0 else None
+                curve, label = (_ways(own.curve)[way], own.label) if own else (None, "")
+                sides.append(Side(row[7:9], float(row[5]), curve, label, edge, key, twin))
+                corners.append(Corner(row[9:], float(row[6])))
+            loops.append(Loop(tuple(sides), tuple(corners)))
         circles = [
-            Circle(row[:2], float(row[2]), int(row[3]), int(row[4])) for row in arrays["circles"]
+            Circle(row[2:4], float(row[4]), int(row[0]), int(row[1])) for row in arrays["circles"]
         ]
         made = replace(self.sides, loops=tuple(loops), circles=tuple(circles))
         return replace(self, sides=made.centred())
+
+
+def _ways(curve: Curve) -> list[Curve]:
+    """Return a curve of the arm's own as sides may run along it, or along its mirror image."""
+    return [way for item in (curve, curve.mirrored()) for way in (item, item.reversed())]
 
 
 def _stretched(side: Side, factors: np.ndarray) -> Side:

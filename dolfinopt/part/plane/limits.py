@@ -312,14 +312,14 @@ def facing(sides: Sides, cell: float, most: float) -> Facing:
     place, other = np.unique(np.stack([pairs[:, 0], number[pairs[:, 1]]]), axis=1)
     apart = ~_together(every, sides)[number[place], other]
     place, other = place[apart], other[apart]
-    own, curves = number[place], [item.piece.curve for item in every]
-    _, near, _ = _closest(curves, other, at[place])
+    own, curves = number[place], np.array([_as_numbers(item.piece.curve) for item in every])
+    _, near, _ = _closest(curves[other], at[place])
     some = np.linalg.norm(near - at[place], axis=1) < most
     own, other, near = own[some], other[some], near[some]
     # Places stand apart: from one curve to the other and back they come to the narrowest one.
     for _ in range(RETURNS):
-        s, p, out = _closest(curves, own, near)
-        t, near, back = _closest(curves, other, p)
+        s, p, out = _closest(curves[own], near)
+        t, near, back = _closest(curves[other], p)
     v = near - p
     width = np.linalg.norm(v, axis=1)
     cosines = np.stack([(v * out).sum(axis=1), -(v * back).sum(axis=1)])
@@ -376,28 +376,31 @@ def _together(every: list[Placed], sides: Sides) -> np.ndarray:
     return result | (stays[:, None] & stays) | np.eye(len(every), dtype=bool)
 
 
-def _closest(
-    curves: Sequence[Curve], number: np.ndarray, p: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return parameter (k,), place and outward normal (k, 2) of the nearest points to p (k, 2)."""
-    # `number` (k,): of the line or arc that each point is compared with.
-    line = np.array([isinstance(c, Line) for c in curves])
-    start = np.array([c.centre if isinstance(c, Arc) else c.start for c in curves])
-    d = np.array([[c.radius, 0.0] if isinstance(c, Arc) else c.end - c.start for c in curves])
-    begin = np.array([c.begin if isinstance(c, Arc) else 0.0 for c in curves])
-    sweep = np.array([c.sweep if isinstance(c, Arc) else 1.0 for c in curves])
-    is_line, s, v, b, w = line[number], start[number], d[number], begin[number], sweep[number]
+def _as_numbers(curve: Curve) -> list[float]:
+    """Return six numbers: a line's start and way, or an arc's centre, radius, begin and sweep."""
+    if isinstance(curve, Arc):
+        return [*curve.centre, curve.radius, 0.0, curve.begin, curve.sweep]
+    return [*curve.start, *(curve.end - curve.start), 0.0, 0.0]
+
+
+def _closest(curves: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return parameter (k,), place and outward normal (k, 2) of the nearest points to p (k, 2).
+
+    Of the line or arc that each point is compared with: curves are (k, 6) of `_as_numbers`.
+    """
+    s, v, (begin, sweep) = curves[:, :2], curves[:, 2:4], curves[:, 4:].T
+    size, is_arc = np.linalg.norm(v, axis=1), (sweep != 0.0)[:, None]
     r = p - s
-    t = np.clip((r * v).sum(axis=1) / (v * v).sum(axis=1), 0.0, 1.0)
-    angle = np.arctan2(r[:, 1], r[:, 0]) - b
-    u = (np.sign(w) * angle % (2.0 * np.pi)) / np.abs(w)
-    beyond = np.where(u > 0.5 + np.pi / np.abs(w), 0.0, 1.0)
-    t = np.where(is_line, t, np.where(u > 1.0, beyond, u))
-    e = np.stack([np.cos(b + w * t), np.sin(b + w * t)], axis=1)
-    at = np.where(is_line[:, None], s + t[:, None] * v, s + v[:, :1] * e)
-    along = v / np.linalg.norm(v, axis=1)[:, None]
-    normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
-    return t, at, np.where(is_line[:, None], normal, np.sign(w)[:, None] * e)
+    along = (r * v).sum(axis=1) / size**2
+    turned = np.arctan2(r[:, 1], r[:, 0]) - begin - 0.5 * sweep  # from the arc's middle
+    turned = (turned + np.pi) % (2.0 * np.pi) - np.pi
+    turned = 0.5 + np.divide(turned, sweep, out=np.zeros_like(sweep), where=sweep != 0.0)
+    t = np.clip(np.where(is_arc[:, 0], turned, along), 0.0, 1.0)
+    angle = begin + sweep * t
+    out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    at = s + np.where(is_arc, size[:, None] * out, t[:, None] * v)
+    right = np.stack([v[:, 1], -v[:, 0]], axis=1) / size[:, None]
+    return t, at, np.where(is_arc, np.sign(sweep)[:, None] * out, right)
 
 
 def _signed(region: Geometry, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

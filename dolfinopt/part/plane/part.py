@@ -200,7 +200,7 @@ class PlanePart:
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
         """Return which places (n, 2) are away from where stress has no limit (n,)."""
-        return is_regular_in_plane(self.shape, self.domain.cell, places, margin)
+        return is_regular_in_plane(self.shape, self.domain, places, margin)
 
     def stress(self, state: DesignState) -> CornerStress:
         """Return the stress at the corners of the triangles of its arm."""

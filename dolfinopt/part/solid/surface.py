@@ -264,12 +264,8 @@ def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> 
     count = len(triangles)
     a, b, c = points[triangles].swapaxes(0, 1)
     outwards = np.einsum("na,na->n", np.cross(b - a, c - a), a - within)
-    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-    order = np.lexsort(np.sort(edges, axis=1).T)
-    edges, sides = np.sort(edges, axis=1)[order], order % count
-    forth = (triangles[:, [0, 1, 2]] < triangles[:, [1, 2, 0]]).T.ravel()[order]
-    pair = np.flatnonzero((edges[1:] == edges[:-1]).all(axis=1))
-    side, other, alike = sides[pair], sides[pair + 1], forth[pair] != forth[pair + 1]
+    edges, pairs = neighbours(triangles)
+    (side, other), alike = pairs.T, edges[:, 0, 0] != edges[:, 1, 0]
     # Every triangle as it is, 0 ... m - 1, and turned, m ... 2 m - 1: which go together.
     start, end = np.concatenate([side, side + count]), np.where(alike, other, other + count)
     end = np.concatenate([end, (end + count) % (2 * count)])
@@ -278,6 +274,18 @@ def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> 
     score = np.bincount(sheet, weights=np.concatenate([outwards, -outwards]))
     turned = score[sheet[:count]] < score[sheet[count:]]
     return Surface(points, np.where(turned[:, None], triangles[:, ::-1], triangles))
+
+
+def neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges that two faces of nodes (n, 3 or 4) share, and these faces (k, 2).
+
+    Edges are (k, 2, 2): both nodes as either face runs along them.
+    """
+    edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+    key = np.sort(edges, axis=1) @ [faces.max(initial=0) + 1, 1]
+    order = np.argsort(key, kind="stable")
+    pair = order[np.flatnonzero(np.diff(key[order]) == 0)[:, None] + [0, 1]]
+    return edges[pair], pair // faces.shape[1]
 
 
 # Of the windowed sinc: steps from cell to cell go, ripples of a smooth field's isosurface.
