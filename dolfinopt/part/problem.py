@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from dolfinopt.part.check import STRESS, Simulated, simulate_parts
@@ -160,8 +160,7 @@ class Problem:
             if item.quantity not in ("volume_fraction", STRESS):
                 rows.append(((1.0 + value) * limit, limit / self._factor(item)))
         smooth, held = np.array(rows).reshape(-1, 2).T
-        shares = np.array([share for share, _ in self._volumes(outlines)])
-        state = State(outlines, bodies, simulated, smooth, held, shares)
+        state = State(outlines, bodies, simulated, smooth, held, self._volumes(outlines)[0])
         limit = self.scene.constraints.limit(STRESS)
         return state if limit is None else self._with_places(state, every, limit)
 
@@ -248,23 +247,21 @@ class Problem:
     def _exponent(self) -> float:
         return max(self.scene.objective.stress_exponent, PLACE_EXPONENT)
 
-    def _volumes(self, outlines: Mapping[int, FreeSides]) -> list[tuple[float, np.ndarray]]:
-        """Return volume over its limit, less 1, and its derivatives (n,), of every such limit."""
-        share = self.scene.design.volume_fraction
-        if share is None:
-            return []
-        ends, rows = np.cumsum([0, *(outline.count for outline in outlines.values())]), []
-        for outline, (first, last) in zip(outlines.values(), pairwise(ends), strict=True):
-            domain, slope = outline.part.domain, np.zeros(ends[-1])
-            slope[first:last] = outline.area_by_x()
+    def _volumes(self, outlines: Mapping[int, FreeSides]) -> tuple[np.ndarray, np.ndarray]:
+        """Return volumes over their limits, less 1, (k,) and their derivatives (k, n)."""
+        share, rows, slopes = self.scene.design.volume_fraction, [], []
+        for outline in outlines.values():
+            domain, t = outline.part.domain, outline.part.domain.thickness
             # What the densities have: sides may have begun a little above the limit.
-            most = max(share * domain.whole, domain.volume)
-            t = domain.thickness
-            rows.append((t * outline.sides.shape.area, t * most, t * slope))
+            most = max((share or 0.0) * domain.whole, domain.volume)
+            rows.append([t * outline.sides.shape.area, t * most])
+            slopes.append(t * outline.area_by_x())
+        every = np.hstack([rows, block_diag(*slopes)])
         if self.scene.design.shared_volume:
-            sizes, limits, slopes = zip(*rows, strict=True)
-            rows = [(sum(sizes), sum(limits), np.sum(slopes, axis=0))]
-        return [(size / most - 1.0, slope / most) for size, most, slope in rows]
+            every = every.sum(axis=0, keepdims=True)
+        if share is None:
+            every = every[:0]
+        return every[:, 0] / every[:, 1] - 1.0, every[:, 2:] / every[:, 1:2]
 
     def slopes(self, state: State) -> np.ndarray:
         """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""
@@ -277,8 +274,7 @@ class Problem:
         for limit, row in zip(every, result, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
-        volumes = [row for _, row in self._volumes(state.outlines)]
-        return np.vstack([self._by_x(state, rows), *volumes])
+        return np.vstack([self._by_x(state, rows), self._volumes(state.outlines)[1]])
 
     def _by_x(self, state: State, rows: list[dict[int, np.ndarray]]) -> np.ndarray:
         """Return derivatives (m, n) by x from those by the nodes of the arms' meshes."""

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.plane.free_sides import FreeSides
@@ -249,18 +250,15 @@ class Search:
 
     def _linear(self, state: State, slopes: np.ndarray) -> Linear:
         """Return the limits that a step of this radius can meet."""
-        reach, far, A, b, first = self.radius * FAR, [], [], [], 0
+        reach, far, A, b = self.radius * FAR, [], [], []
         for outline in state.outlines.values():
             g, own = outline.rows()
             near = g > -reach * outline.cell * np.abs(own).sum(axis=1) - 0.1 * outline.cell
-            wide = np.zeros((int(near.sum()), slopes.shape[1]))
-            wide[:, first : first + outline.count] = own[near]
-            A.append(wide / outline.cell)
+            A.append(own[near] / outline.cell)
             b.append(np.maximum(-g[near] / outline.cell, 0.0))
-            first += outline.count
             far.append(np.full(outline.count, reach * outline.cell))
         hot = {key: row for key, (row, _) in self.rows.items()}
-        return Linear(slopes, hot, np.vstack(A), np.concatenate(b), np.concatenate(far))
+        return Linear(slopes, hot, block_diag(*A), np.concatenate(b), np.concatenate(far))
 
     def _tried(self, state: State, linear: Linear) -> Step | None:
         """Return the best of the trial steps of one radius; None: none makes parts."""
@@ -316,11 +314,10 @@ class Search:
 
     def _led_to(self, state: State, x: np.ndarray) -> tuple[State, np.ndarray, bool] | None:
         """Return the state after a step, the whole step, and whether its meshes are new."""
-        first, after, whole = 0, dict[int, FreeSides](), []
+        after, whole = dict[int, FreeSides](), []
+        ends = np.cumsum([outline.count for outline in state.outlines.values()])
         try:
-            for k, outline in state.outlines.items():
-                part = x[first : first + outline.count]
-                first += outline.count
+            for (k, outline), part in zip(state.outlines.items(), np.split(x, ends[:-1])):
                 near = outline.moved(part).nearest()
                 if near is None:
                     return None

@@ -234,9 +234,8 @@ def corner_stress(state: DesignState) -> CornerStress:
     corners = compat.cell_geometry_nodes(mesh.mesh, mesh.num_cells)
     count = len(mesh.mesh.geometry.x)
     sides = np.array(facet_corners(dim, dim + 1))
-    facets = np.sort(corners[:, sides], axis=2) @ count ** np.arange(dim)
-    _, which, number = np.unique(facets, return_inverse=True, return_counts=True)
-    rim = (number == 1)[which.ravel()].reshape(facets.shape)
+    facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
+    rim = np.bincount(facets.ravel())[facets] == 1
     touches = np.zeros(corners.shape, dtype=bool)  # a corner of one of its own outer sides
     for facet, side in enumerate(sides):
         touches[np.ix_(rim[:, facet], side)] = True

@@ -30,7 +30,7 @@ from dolfinopt.part.plane.curves import (
     circle_through,
     turn_between,
 )
-from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, SHORT, TURN, Limits
+from dolfinopt.part.plane.limits import LARGEST, MOST_TURN, NEARLY, SHORT, TURN, Limits
 from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.sides import (
     BrokenError,
@@ -49,7 +49,6 @@ LEAST = 0.4  # length of a side that is worth drawing, cells
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
 REACH = 3.0  # cells from the ends of two sides within which they meet
 STEEP = 0.5 * MOST_TURN  # half of the turn of a rounded corner, at most
-ROOM = 0.5  # share of a side that a fillet at one of its ends may take
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +107,11 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
-    for halvings in range(HALVINGS):
-        whole = _drawn(outline, limits, 0.5**halvings * tolerance)
-        with suppress(BrokenError):
-            made = limits.nearest(whole, area=area) or limits.nearest(whole)
-            if made is not None:
-                return made[0]
+    drawn = _drawn(outline, limits, tolerance)
+    with suppress(BrokenError):
+        result = limits.nearest(drawn, area=area) or limits.nearest(drawn)
+        if result is not None:
+            return result[0]
     raise InputError(
         f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
         "the outline; choose another --tolerance or a smaller --tool-radius"
@@ -123,7 +121,7 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
 def _drawn(outline: Outline, limits: Limits, tolerance: float) -> Sides:
     """Return the sides of all contours; finer ones of those that a tolerance spoils."""
     pen = _Pen(outline, limits, counting())
-    contours = list(_contours(outline, tolerance, np.pi * limits.tool**2))
+    contours = list(_contours(outline, np.pi * limits.tool**2))
     drawn = {k: pen.drawn(item, tolerance) for k, item in enumerate(contours)}
     for halvings in range(1, HALVINGS + 1):
         for k in _spoilt(drawn, contours, outline, tolerance):
@@ -202,10 +200,9 @@ def _rings(outline: Outline) -> Iterator[np.ndarray]:
                 yield points
 
 
-def _runs(points: np.ndarray, lines: Sequence[Any], chord: float, tolerance: float) -> list[Run]:
+def _runs(points: np.ndarray, lines: Sequence[Any], chord: float) -> list[Run]:
     """Cut a closed polygon where it comes to another curve."""
     on = _owners(points, lines, 3.0 * chord)
-    on = _without_specks(points, on, tolerance)
     return [
         Run(points[np.append(block, block[-1] + 1) % len(points)], int(on[block[0]]))
         for block in _blocks(on)
@@ -235,17 +232,6 @@ def _blocks(on: np.ndarray) -> list[np.ndarray]:
         return [np.arange(len(on))]
     ends = np.append(starts[1:], starts[0] + len(on))
     return [np.arange(a, b) % len(on) for a, b in zip(starts, ends, strict=True)]
-
-
-def _without_specks(points: np.ndarray, on: np.ndarray, size: float) -> np.ndarray:
-    """Make blocks on curves that are shorter than `size` free where both neighbours are."""
-    step = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
-    blocks = _blocks(on)
-    for k, block in enumerate(blocks):
-        before, after = on[blocks[k - 1][0]], on[blocks[(k + 1) % len(blocks)][0]]
-        if len(blocks) > 1 and before == after == -1 and step[block].sum() < size:
-            on[block] = -1
-    return on
 
 
 # -- loops of sides -------------------------------------------------------------------------------
@@ -279,7 +265,7 @@ class _Contour:
         return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1))) * (1.0 + self.halved)
 
 
-def _contours(outline: Outline, tolerance: float, hole: float) -> Iterator[_Contour]:
+def _contours(outline: Outline, hole: float) -> Iterator[_Contour]:
     """Yield the contours of an outline, but for smaller holes, m2."""
     import shapely
 
@@ -292,7 +278,7 @@ def _contours(outline: Outline, tolerance: float, hole: float) -> Iterator[_Cont
         shapely.LineString(np.vstack([c.at(c.parameters(outline.chord)), c.end])) for c in curves
     ]
     for ring in _rings(outline):
-        runs = _runs(ring, lines, outline.chord, tolerance)
+        runs = _runs(ring, lines, outline.chord)
         for chain, halved in _chains(runs, len(domain.edges) if domain.symmetric else -2):
             result = _Contour(chain, halved, domain.symmetric and not halved)
             if result.area >= hole:
@@ -318,7 +304,11 @@ class _Pen:
         """Return the sides along a contour; None where they do not close."""
         chain, halved, twins, names = contour.chain, contour.halved, contour.twins, self.names
         if (circle := _free_circle(chain, halved, tolerance)) is not None:
-            return Sides((), tuple(_named_circles(circle, twins, halved, names)))
+            key = next(names)
+            twin = next(names) if twins else key if halved else -1
+            image = Circle(circle.centre * MIRROR, circle.radius, twin, key)
+            circle = replace(circle, key=key, twin=twin)
+            return Sides((), (circle, image) if twins else (circle,))
         edges, outer = self.outline.domain.edges, self.outline.domain.outer_edges
         closed = len(chain) == 1 and not halved
         drawn = [item for run in chain for item in _sides_along(run, edges, tolerance, closed)]
@@ -387,17 +377,6 @@ def _free_circle(chain: Sequence[Run], halved: bool, tolerance: float) -> Circle
     if off > min(tolerance, 0.1 * radius):
         return None
     return Circle(centre * [1.0, 0.0] if halved else centre, radius)
-
-
-def _named_circles(circle: Circle, twins: bool, halved: bool, names: Iterator[int]) -> list[Circle]:
-    key = next(names)
-    if halved:
-        return [replace(circle, key=key, twin=key)]
-    if not twins:
-        return [replace(circle, key=key)]
-    twin = next(names)
-    image = Circle(circle.centre * MIRROR, circle.radius, twin, key)
-    return [replace(circle, key=key, twin=twin), image]
 
 
 def _sides_along(run: Run, edges: Sequence[Edge], tolerance: float, closed: bool) -> list[Drawn]:
@@ -552,7 +531,7 @@ def _worst(drawn: Sequence[Drawn], limits: Limits) -> tuple[int | None, bool]:
         room -= need[k] + need[j] + LEAST * limits.cell
         meets = not np.isnan([turns[k], turns[j]]).any()
         both = before.free and item.side.free and item.side.twin != before.key
-        straight = both and abs(turns[k]) < 2.0 * TURN
+        straight = both and abs(turns[k]) < NEARLY * TURN
         if room >= 0.0 and meets and not straight:
             continue
         # The shortest one: where two sides do not meet well, a long one looks turned round.
@@ -597,7 +576,7 @@ def looped(
             continue
         half = min(-turn / 2.0, STEEP)
         ends = (places[k - 1], places[(k + 1) % len(places)])
-        room = ROOM * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
+        room = 0.5 * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
         radius = min(radius_at(b, place, half), room, 0.9 * LARGEST * limits.cell)
         radius = max(radius, limits.tool, SHORT * limits.cell)
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])

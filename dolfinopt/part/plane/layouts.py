@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 BAY, LAST, STEEPER = 4.0, 0.6, 0.7  # of the first arm; of the last one over it; of every truss
 STRUT = 0.6  # width of struts over that of the flanges
 FEWEST = 2  # bays of the first truss; every further one of a short arm has one more
-SMALLEST_HOLE = 4.0  # area of a hole that is worth its outline, squared cells
 CLOSE = 0.2  # distance of its sides from the polygon, cells
 
 
@@ -56,10 +55,8 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     domain, drawn = part.domain, part.outline
     limits = limits_of_part(domain, drawn.tool_radius)
     stays = limits.stays
-    arm, span = _between_bores(limits.arm, stays, domain.cell)
+    arm, span = _between_bores(limits.arm, stays)
     fillet = max(domain.cell, drawn.tool_radius)
-
-    least = SMALLEST_HOLE * domain.cell**2
 
     def rounded(hole: Geometry) -> Geometry:
         return hole.buffer(-fillet, quad_segs=32).buffer(fillet, quad_segs=32)
@@ -67,7 +64,7 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     def polygon(flange: float, rounds: bool = True) -> Polygon:
         widths = flange, max(STRUT * flange, domain.minimum_member)
         holes = polygons_of(_windows(arm, stays, span, widths, slope, fewest, domain.symmetric))
-        kept = [rounded(item) if rounds else item for item in holes if rounded(item).area > least]
+        kept = [rounded(item) if rounds else item for item in holes if not rounded(item).is_empty]
         return max(polygons_of(arm.difference(shapely.union_all(kept))), key=lambda item: item.area)
 
     def missing(flange: float) -> float:
@@ -91,27 +88,17 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     return replace(part, outline=result, sides=sides)
 
 
-def _between_bores(
-    arm: Geometry, stays: Geometry, cell: float
-) -> tuple[Geometry, tuple[float, float]]:
+def _between_bores(arm: Geometry, stays: Geometry) -> tuple[Geometry, tuple[float, float]]:
     """Return an arm without what lies beyond bores at its ends, and from where to where bays go."""
     # Flanges run straight from a bore's ring to the arm's own edges where the bays begin.
     import shapely
 
-    left, _, right, _ = arm.bounds
+    left, low, right, high = arm.bounds
     middle, rings = 0.5 * (left + right), [item.bounds for item in polygons_of(stays)]
-    ahead = [box for box in rings if box[2] < middle]
-    behind = [box for box in rings if box[0] > middle]
-    first = max((b for _, _, b, _ in ahead), default=left)
-    last = min((a for a, _, _, _ in behind), default=right)
-    low = left if not ahead or min(a for a, _, _, _ in ahead) < left + cell else first
-    high = right if not behind or max(b for _, _, b, _ in behind) > right - cell else last
-    if (low, high) == (left, right):
-        return arm, (left, right)
-    kept = shapely.union_all(
-        [stays, arm.intersection(shapely.box(low, arm.bounds[1], high, arm.bounds[3]))]
-    )
-    return arm.intersection(kept.convex_hull), (low, high)
+    first = max((box[2] for box in rings if box[2] < middle), default=left)
+    last = min((box[0] for box in rings if box[0] > middle), default=right)
+    between = arm.intersection(shapely.box(first, low, last, high))
+    return arm.intersection(shapely.union_all([stays, between]).convex_hull), (first, last)
 
 
 def _windows(

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 SHORT = 0.05  # least length of a side, cells
 TURN, MOST_TURN = np.radians(4.0), np.radians(172.0)  # of the outline at a corner
+NEARLY = 2.0  # of the least length or turn, up to which a side vanishes, a corner hardly turns
 LARGEST = 8.0  # radius of a fillet, cells
 THIN = 1e-3  # m, least width of members unless the scene states one
 NARROW = 0.9  # of the width asked for, below which a member or gap is told

@@ -97,12 +97,7 @@ class Side:
             along = unit(self.angle)
             return self.point + ((place - self.point) @ along) * along, along, 0.0
         point, t = projected(self.curve, place)
-        at = min(max(t, 0.0), 1.0)
-        if isinstance(self.curve, Arc):
-            bend = np.sign(self.curve.sweep) / self.curve.radius
-            along = left(point - self.curve.centre) * bend
-            return point, along, float(bend)
-        return point, direction(self.curve, at), float(curvature(self.curve, np.array([at]))[0])
+        return point, direction(self.curve, t), float(curvature(self.curve, np.array([t]))[0])
 
     def moved(self, offset: float, turn: float) -> Side:
         """Return a line that moves, moved outwards, m, and turned to the left, rad."""

@@ -13,11 +13,9 @@ import numpy as np
 
 from dolfinopt.part.plane.curves import turn_between
 from dolfinopt.part.plane.fit import Drawn, cleaned, looped, without
-from dolfinopt.part.plane.limits import SHORT, TURN, Limits
+from dolfinopt.part.plane.limits import NEARLY, SHORT, TURN, Limits
 from dolfinopt.part.plane.sides import Sides, unit
 
-NEARLY = 1.2  # of the least turn, up to which a corner hardly turns
-VANISHING = 2.5  # of the least length, up to which a side vanishes
 SMALL = 20.0  # area of a hole that may close, squared cells or tool radii
 
 
@@ -30,7 +28,7 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
             if not item.side.free or item.side.key in done or len(drawn) < 4:
                 continue
             done |= item.names
-            if np.linalg.norm(item.end - item.start) < VANISHING * SHORT * limits.cell:
+            if np.linalg.norm(item.end - item.start) < NEARLY * SHORT * limits.cell:
                 yield from _without(sides, item.names, {}, limits, outer)
             turn = abs(turn_between(unit(item.side.angle), unit(after.side.angle)))
             if after.side.free and turn < NEARLY * TURN and not after.names & item.names:

@@ -293,8 +293,7 @@ PASSES, STEPS, RIPPLES = 40, 0.03, 0.15
 FURTHEST = 0.4  # of a cell that smoothing moves a point
 ROOM = 0.5  # and of its distance from the arm's own faces
 CORRECTIONS, SAME_VOLUME = 20, 1e-9  # Newton's steps; relative
-MANY = 200_000  # pairs of an edge and a triangle that are looked at together
-CANDIDATES = 60  # triangles near an edge, about
+MANY = 3_000  # edges that are looked at together, with some 60 triangles near each
 TOUCHES = 1e-9  # of an edge and of a triangle: what only touches does not cross
 
 
@@ -409,7 +408,7 @@ def crossings(surface: Surface) -> np.ndarray:
     result = []
     tree, middle = cKDTree(centres), 0.5 * (start + end)
     reach = 0.5 * np.linalg.norm(end - start, axis=1) + radii.max(initial=0.0)
-    for part in np.array_split(np.arange(len(edges)), max(1, len(edges) * CANDIDATES // MANY)):
+    for part in np.array_split(np.arange(len(edges)), 1 + len(edges) // MANY):
         near = tree.query_ball_point(middle[part], reach[part])
         edge = np.repeat(part, [len(item) for item in near])
         triangle = np.concatenate([*near, []]).astype(int)

@@ -48,13 +48,13 @@ def measured_widths(domain: SolidDomain, surface: Surface) -> Widths:
     points, outward = np.asarray(places.cell_centers().points), np.asarray(places.face_normals)
     asked = max(domain.filter_radius, domain.minimum_member, domain.minimum_gap, 2.0 * domain.cell)
     extent = float(np.ptp(points, axis=0).max())
-    member = _narrowest(surface, points, -outward, (0.5 * spacing, extent), 1.0)
-    gap = _narrowest(surface, points, outward, (0.5 * spacing, WIDE * asked), -1.0)
+    member = _narrowest(triangles, points, -outward, (0.5 * spacing, extent), 1.0)
+    gap = _narrowest(triangles, points, outward, (0.5 * spacing, WIDE * asked), -1.0)
     return Widths(member, gap, spacing)
 
 
 def _narrowest(
-    surface: Surface,
+    triangles: Any,
     points: np.ndarray,
     along: np.ndarray,
     reach: tuple[float, float],
@@ -63,22 +63,19 @@ def _narrowest(
     """Return the least distance from points to what faces them, m; None: nothing does.
 
     Args:
-        surface: closed.
+        triangles: of a closed surface, of VTK.
         points: (n, 3) m.
         along: (n, 3) unit vectors.
         reach: least and largest distance that is looked at, m.
         sense: 1 where rays leave the material there, -1 where they enter it.
     """
-    import pyvista
     from vtkmodules.vtkCommonCore import mutable
     from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
     locator = vtkStaticCellLocator()
-    locator.SetDataSet(pyvista.PolyData.from_regular_faces(surface.points, surface.triangles))
+    locator.SetDataSet(triangles)
     locator.BuildLocator()
-    a, b, c = surface.corners.swapaxes(0, 1)
-    normal = np.cross(b - a, c - a)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-300)[:, None]
+    normal = triangles.face_normals
     t: Any = mutable(0.0)
     cell: Any = mutable(0)
     hit: tuple[Any, ...] = (0.0, t, [0.0] * 3, [0.0] * 3, mutable(0), cell)
