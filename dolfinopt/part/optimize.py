@@ -19,11 +19,11 @@ from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import Column, refined
 from dolfinopt.part.folder import Forms, Saved
-from dolfinopt.part.part import Meshes, Part, mesh_parts
+from dolfinopt.part.part import Curves, Meshes, Part, mesh_parts
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
-from dolfinopt.part.plane.part import PlanePart, fuller
+from dolfinopt.part.plane.part import PlanePart, make_part
 from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import PRICE, Search
 from dolfinopt.part.solid.part import SolidPart
@@ -228,7 +228,8 @@ def _free(scene: Scene, k: int, part: Part, more: float = 1.0) -> FreeSides:
         flat.domain, flat.outline.tool_radius, scene.design.minimum_gap, min([1.0, *sizes])
     )
     if more > 1.0:
-        flat = fuller(flat, more)
+        curves = Curves(flat.outline.tool_radius)
+        flat = replace(make_part(flat.domain, curves, more), tolerance=flat.tolerance)
     made = FreeSides(flat, flat.sides, limits, part.domain if isinstance(part, SolidPart) else None)
     result = made.nearest()
     return made if result is None else result[0]

@@ -153,11 +153,6 @@ class Outline:
         return CHORD * self.domain.cell
 
 
-def default_tool(domain: Domain) -> float:
-    """Return the tool's radius where none is asked for, m."""
-    return min(TOOL, SLIM * domain.height)
-
-
 def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
     """Find the outline whose area is the material's volume over the thickness.
 

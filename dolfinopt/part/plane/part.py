@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -25,7 +25,7 @@ from dolfinopt.part.plane.limits import (
     rounded_radii,
     thinnest_member,
 )
-from dolfinopt.part.plane.outline import Outline, default_tool, draw_outline
+from dolfinopt.part.plane.outline import SLIM, TOOL, Outline, draw_outline
 from dolfinopt.part.plane.sides import Sides
 from dolfinopt.part.stress import corner_stress, is_regular_in_plane
 from dolfinopt.part.workshop_files import (
@@ -224,31 +224,22 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
     return extruded_facets(loops, thickness)
 
 
-def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
-    """Return the part of one arm, see `part.make_parts`."""
+def make_part(domain: Domain, curves: Curves = DEFAULTS, more: float = 1.0) -> PlanePart:
+    """Return the part of one arm that encloses so many times the volume of its densities."""
     away = domain.cell if curves.tolerance is None else curves.tolerance
     if away > domain.cell:
         raise InputError(
             f"--tolerance = {away:g} m: expected at most a cell of arm {domain.name!r}, "
             f"{domain.cell:.3g} m"
         )
-    tool = default_tool(domain) if curves.tool_radius is None else curves.tool_radius
+    tool = min(TOOL, SLIM * domain.height) if curves.tool_radius is None else curves.tool_radius
     fine = min(away, TOLERANCE, CELLS * domain.cell)
     limits = limits_of_part(domain, tool)
-    outline = draw_outline(domain, limits)
-    sides = fitted_sides(outline, limits, away, domain.volume)
+    outline = draw_outline(domain, limits, more)
+    sides = fitted_sides(outline, limits, away, more * domain.volume)
     if curves.rounds:
         sides = rounded_radii(sides, limits)
     return PlanePart(domain, outline, sides, fine)
-
-
-def fuller(part: PlanePart, more: float) -> PlanePart:
-    """Return the part of the contour of its densities that encloses so many times their volume."""
-    domain, tool = part.domain, part.outline.tool_radius
-    limits = limits_of_part(domain, tool)
-    outline = draw_outline(domain, limits, more)
-    sides = fitted_sides(outline, limits, domain.cell, outline.area)
-    return replace(part, outline=outline, sides=sides)
 
 
 def _count(number: int, name: str) -> str:
