@@ -22,6 +22,7 @@ from dolfinopt.part.solid.surface import Surface
 HALF = 0.9 * np.pi  # sweep of an arc from which on it is divided
 DATE = "2000-01-01T00:00:00"  # of all files, as in DXF: a shape always gives the same bytes
 UP = (0.0, 0.0, 1.0)
+NamedCurves = Sequence[tuple[Curve, str]]  # a closed loop, each curve with its name
 
 
 def face_text(shape: Shape, name: str) -> str:
@@ -31,9 +32,8 @@ def face_text(shape: Shape, name: str) -> str:
     Splines are cut at their knots, see `solid_text`.
     """
     file = _File()
-    loops = [_Loop(file, _edges(loop)) for loop in shape.loops]
-    edges = [loop.edges(0.0) for loop in loops]
-    face = _flat_face(file, edges, 0.0, upwards=True)
+    loops = [_edges(loop) for loop in shape.loops]
+    face = _flat_face(file, loops, 0.0, upwards=True)
     shell = file.add(f"OPEN_SHELL('',({face}))")
     model = file.add(f"SHELL_BASED_SURFACE_MODEL({_string(name)},({shell}))")
     return file.text(name, f"{name}_face.step", "MANIFOLD_SURFACE_SHAPE_REPRESENTATION", model)
@@ -47,16 +47,11 @@ def solid_text(shape: Shape, thickness: float, name: str, bottom: float = 0.0) -
     of many.
     """
     file = _File()
-    loops = [_Loop(file, _edges(loop)) for loop in shape.loops]
+    loops = [_edges(loop) for loop in shape.loops]
     z0, z1 = MM * bottom, MM * (bottom + thickness)
-    below = [loop.edges(z0) for loop in loops]
-    above = [loop.edges(z1) for loop in loops]
-    faces = [
-        _flat_face(file, below, z0, upwards=False),
-        _flat_face(file, above, z1, upwards=True),
-    ]
-    for loop, low, high in zip(loops, below, above, strict=True):
-        faces += loop.walls(low, high)
+    faces = [_flat_face(file, loops, z0, upwards=False), _flat_face(file, loops, z1, upwards=True)]
+    for loop in loops:
+        faces += _walls(file, loop, z0, z1)
     shell = file.add(f"CLOSED_SHELL('',({','.join(faces)}))")
     solid = file.add(f"MANIFOLD_SOLID_BREP({_string(name)},{shell})")
     return file.text(name, f"{name}.step", "ADVANCED_BREP_SHAPE_REPRESENTATION", solid)
@@ -87,43 +82,31 @@ def _divided(curve: Curve) -> list[Curve]:
 # -- STEP: topology ----------------------------------------------------------------------------
 
 
-class _Loop:
-    """A closed loop of curves, its edges at any height, and the walls between two of them."""
+def _edges_at(file: _File, loop: NamedCurves, z: float) -> list[str]:
+    """Add a loop's edges at a height, mm, and return them; each ends where the next one begins."""
+    corners, result = [file.vertex(curve.start, z) for curve, _ in loop], []
+    for (curve, name), a, b in zip(loop, corners, [*corners[1:], corners[0]], strict=True):
+        sense = ".F." if isinstance(curve, Arc) and curve.sweep < 0.0 else ".T."
+        edge = f"EDGE_CURVE({_string(name)},{a},{b},{file.curve(curve, z)},{sense})"
+        result.append(file.add(edge))
+    return result
 
-    def __init__(self, file: _File, curves: Sequence[tuple[Curve, str]]):
-        self.file, self.curves = file, curves
-        self.vertices: dict[float, list[str]] = {}
 
-    def edges(self, z: float) -> list[str]:
-        """Add the edges at a height, mm, and return them; each ends where the next one begins."""
-        file = self.file
-        corners = [file.vertex(curve.start, z) for curve, _ in self.curves]
-        self.vertices[z] = corners
-        result = []
-        for k, (curve, name) in enumerate(self.curves):
-            ends = f"{corners[k]},{corners[(k + 1) % len(corners)]}"
-            sense = ".F." if isinstance(curve, Arc) and curve.sweep < 0.0 else ".T."
-            result.append(
-                file.add(f"EDGE_CURVE({_string(name)},{ends},{file.curve(curve, z)},{sense})")
-            )
-        return result
-
-    def walls(self, low: Sequence[str], high: Sequence[str]) -> list[str]:
-        """Add the faces between edges at two heights and return them; outwards is to the right."""
-        (z, below), (_, above) = self.vertices.items()
-        file = self.file
-        posts = []
-        for (curve, _), a, b in zip(self.curves, below, above, strict=True):
-            line = f"LINE('',{file.point(curve.start, z)},{file.vector(UP)})"
-            posts.append(file.add(f"EDGE_CURVE('',{a},{b},{file.add(line)},.T.)"))
-        result = []
-        for k, (curve, name) in enumerate(self.curves):
-            after = posts[(k + 1) % len(posts)]
-            sides = [(low[k], ".T."), (after, ".T."), (high[k], ".F."), (posts[k], ".F.")]
-            bound = _bound(file, sides)
-            surface, sense = file.wall(curve, z)
-            result.append(file.add(f"ADVANCED_FACE({_string(name)},({bound}),{surface},{sense})"))
-        return result
+def _walls(file: _File, loop: NamedCurves, z0: float, z1: float) -> list[str]:
+    """Add the faces between a loop's edges at two heights, mm; outwards is to the right."""
+    posts, result = [], []
+    for curve, _ in loop:
+        a, b = (file.vertex(curve.start, z) for z in (z0, z1))
+        line = f"LINE('',{file.point(curve.start, z0)},{file.vector(UP)})"
+        posts.append(file.add(f"EDGE_CURVE('',{a},{b},{file.add(line)},.T.)"))
+    edges = (_edges_at(file, loop, z) for z in (z0, z1))
+    for (curve, name), low, high, post, after in zip(
+        loop, *edges, posts, [*posts[1:], posts[0]], strict=True
+    ):
+        bound = _bound(file, [(low, ".T."), (after, ".T."), (high, ".F."), (post, ".F.")])
+        surface, sense = file.wall(curve, z0)
+        result.append(file.add(f"ADVANCED_FACE({_string(name)},({bound}),{surface},{sense})"))
+    return result
 
 
 def _bound(file: _File, sides: Iterable[tuple[str, str]]) -> str:
@@ -132,16 +115,14 @@ def _bound(file: _File, sides: Iterable[tuple[str, str]]) -> str:
     return file.add(f"FACE_BOUND('',{loop},.T.)")
 
 
-def _flat_face(file: _File, loops: Sequence[Sequence[str]], z: float, upwards: bool) -> str:
-    """Add the plane face within loops of edges, whose material is to their left from above."""
-    bounds = [
-        _bound(
-            file, [(e, ".T.") for e in loop] if upwards else [(e, ".F.") for e in reversed(loop)]
-        )
-        for loop in loops
-    ]
-    plane = file.add(f"PLANE('',{file.axes(np.zeros(2), z, UP, (1.0, 0.0, 0.0))})")
+def _flat_face(file: _File, loops: Sequence[NamedCurves], z: float, upwards: bool) -> str:
+    """Add the plane face within loops at a height, material to their left from above."""
     sense = ".T." if upwards else ".F."
+    bounds = []
+    for loop in loops:
+        edges = _edges_at(file, loop, z)[:: 1 if upwards else -1]
+        bounds.append(_bound(file, [(edge, sense) for edge in edges]))
+    plane = file.add(f"PLANE('',{file.axes(np.zeros(2), z, UP, (1.0, 0.0, 0.0))})")
     return file.add(f"ADVANCED_FACE('',({','.join(bounds)}),{plane},{sense})")
 
 
