@@ -55,9 +55,11 @@ def lowest_buckling(
         if not loads:
             continue
         # All motions one after the other: what is worst along one tells of the others, too.
-        whole = np.concatenate([item.coefficients / item.stiffer for item in loads])
+        coefficients = np.concatenate([item.coefficients / item.stiffer for item in loads])
         of = np.repeat(range(len(loads)), [len(item.instants) for item in loads])
-        every = replace(loads[0], coefficients=whole, stiffer=1.0, instants=np.arange(len(whole)))
+        every = replace(
+            loads[0], coefficients=coefficients, stiffer=1.0, instants=np.arange(len(coefficients))
+        )
         for each in pressed(arms[k].current, every):
             load = loads[of[each.instant]]
             n = load.instants[each.instant - int(np.argmax(of == of[each.instant]))]

@@ -212,12 +212,9 @@ class Region:
         import shapely
 
         rings = [sampled([edge.curve for edge in loop], tolerance) for loop in self.loops]
-        lines = [shapely.LinearRing(ring) for ring in rings]
-        # Even-odd: a loop within another one is a hole.
-        whole = shapely.Polygon()
-        for line in sorted(lines, key=lambda item: -shapely.Polygon(item).area):
-            whole = whole.symmetric_difference(shapely.Polygon(line))
-        return shapely.union_all([whole, *(other.area_inside(tolerance) for other in self.others)])
+        # A loop within another one is a hole.
+        own = shapely.build_area(shapely.MultiLineString([shapely.LinearRing(r) for r in rings]))
+        return shapely.union_all([own, *(other.area_inside(tolerance) for other in self.others)])
 
 
 @dataclass(frozen=True, eq=False)

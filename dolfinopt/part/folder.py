@@ -109,49 +109,49 @@ def write_parts(
         OutputError: the disk is full, for instance.
     """
     with tempfile.TemporaryDirectory(prefix="dolfinopt-part-") as name:
-        made = Path(name)
+        source = Path(name)
         for arm, k in _owners(scene).items():
             if k not in parts:
                 continue
             for ending, data in parts[k].files(arm, f"{arm} of {scene.name}"):
                 raw = data.encode() if isinstance(data, str) else data
-                write_bytes(made / f"{arm}{ending}", raw)
+                write_bytes(source / f"{arm}{ending}", raw)
             if meshes is not None:
-                meshes[k].write(made / f"{arm}.msh")
+                meshes[k].write(source / f"{arm}.msh")
         if meshes is not None:
-            write_text(made / SCENE, scene_text(scene, parts, folder))
+            write_text(source / SCENE, scene_text(scene, parts, folder))
         if pictures is not None:
-            pictures(made)
+            pictures(source)
         figures = figures_of(scene, parts, meshes, check, optimized)
-        publish(made, folder, file_names(scene), figures, design)
+        publish(source, folder, file_names(scene), figures, design)
     return figures
 
 
 def publish(
-    made: Path,
+    source: Path,
     folder: Path,
     names: Sequence[str],
     figures: Mapping[str, Any],
     design: Path | None,
 ) -> None:
     """Replace the files of a folder by those made elsewhere: all or none, part.json last."""
-    written = {FIGURES, *(name for name in names if (made / name).exists())}
+    written = {FIGURES, *(name for name in names if (source / name).exists())}
     record = {**figures, **record_of_parts(design, folder, written)}
-    write_text(made / FIGURES, json.dumps(record, indent=1) + "\n")
+    write_text(source / FIGURES, json.dumps(record, indent=1) + "\n")
     with working_in(folder):
-        _replace(made, folder, names)
+        _replace(source, folder, names)
 
 
-def _replace(made: Path, folder: Path, names: Sequence[str]) -> None:
+def _replace(source: Path, folder: Path, names: Sequence[str]) -> None:
     for left in folder.glob(f"{STAGE}*"):
         shutil.rmtree(left, ignore_errors=True)
     with writing(folder):
         stage = Path(tempfile.mkdtemp(prefix=STAGE, dir=folder))
     try:
         with writing(folder):
-            present = [name for name in reversed(names) if (made / name).exists()]
+            present = [name for name in reversed(names) if (source / name).exists()]
             for name in present:
-                shutil.copyfile(made / name, stage / name)
+                shutil.copyfile(source / name, stage / name)
         remove_stale(folder, names)
         with writing(folder):
             for name in present:

@@ -142,8 +142,8 @@ class BodyMesh:
         if inner.any():
             adjoint = splu(laplacian[inner][:, inner].tocsc()).solve(result[inner])
             result[~inner] -= laplacian[inner][:, ~inner].T @ adjoint
-        whole = np.moveaxis(result.reshape(count, *by_nodes.shape[::2]), 0, 1)
-        return whole[:, self.sides[:, 0]]
+        by_places = np.moveaxis(result.reshape(count, *by_nodes.shape[::2]), 0, 1)
+        return by_places[:, self.sides[:, 0]]
 
     @property
     def owners(self) -> np.ndarray:

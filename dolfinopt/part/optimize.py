@@ -153,8 +153,10 @@ def optimize_parts(
     gc.collect()
     gc.freeze()  # what is there already need not be looked through after each evaluation
     owned = {k: part for k, part in parts.items() if k not in scene.patterns}
-    one = _judged(scene, dict(parts)) if before is None else before
-    given = Found("the parts themselves", dict(parts), 0, one.objective, one.limits, "as they were")
+    column = _judged(scene, dict(parts)) if before is None else before
+    given = Found(
+        "the parts themselves", dict(parts), 0, column.objective, column.limits, "as they were"
+    )
     outlines: Outlines = {k: _free(scene, k, part) for k, part in owned.items()}
     if not any(outline.count for outline in outlines.values()):
         raise InputError("--optimize: the parts have no free curves: nothing can move")
@@ -162,8 +164,8 @@ def optimize_parts(
     interrupted = False
     saved = {item.start: item for item in known}
 
-    def kept(one: Saved) -> None:
-        saved[one.start] = one
+    def kept(search: Saved) -> None:
+        saved[search.start] = search
         if keep is not None:
             keep(tuple(saved.values()))
 
@@ -230,15 +232,15 @@ def _free(scene: Scene, k: int, part: Part, more: float = 1.0) -> FreeSides:
     if more > 1.0:
         curves = Curves(flat.outline.tool_radius)
         flat = replace(make_part(flat.domain, curves, more), tolerance=flat.tolerance)
-    made = FreeSides(flat, flat.sides, limits, part.domain if isinstance(part, SolidPart) else None)
-    result = made.nearest()
-    return made if result is None else result[0]
+    free = FreeSides(flat, flat.sides, limits, part.domain if isinstance(part, SolidPart) else None)
+    result = free.nearest()
+    return free if result is None else result[0]
 
 
-def _rank(scene: Scene, found: Found) -> tuple[float, float]:
+def _rank(scene: Scene, result: Found) -> tuple[float, float]:
     """Return what orders designs, best first: feasible ones by their objective, else by excess."""
-    excess = max((0.0 if limit.met else limit.excess for limit in found.limits), default=0.0)
-    return excess, -found.value if objective_of(scene).turned else found.value
+    excess = max((0.0 if limit.met else limit.excess for limit in result.limits), default=0.0)
+    return excess, -result.value if objective_of(scene).turned else result.value
 
 
 def _judged(scene: Scene, parts: dict[int, Part]) -> Column:
@@ -324,14 +326,14 @@ class Descent:
         """Return what finer meshes say of the first outlines that can be meshed."""
         scene = self.search.problem.scene
         for outlines in tried:  # sides that all but touch cannot
-            made = self.search.problem.parts_of(outlines)
+            parts = self.search.problem.parts_of(outlines)
             with suppress(ConvergenceError, InputError):
-                column = _judged(scene, made)
+                column = _judged(scene, parts)
                 break
         else:
             raise ConvergenceError("no parts of this search can be simulated")
         steps, value, limits = self.search.steps, column.objective, column.limits
-        result = Found(start, made, steps, value, limits, self.ending)
+        result = Found(start, parts, steps, value, limits, self.ending)
         if self.best is None or _rank(scene, result) < _rank(scene, self.best):
             self.best, self.forms = result, outlines
         return result

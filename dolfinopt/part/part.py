@@ -200,13 +200,13 @@ def make_parts(
     designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
     with together(world):
         mine = {k: _tried(scene, k, mesh, designs[k], curves) for k, mesh in meshes.items()}
-    found: dict[int, Part | InputError] = {}
+    results: dict[int, Part | InputError] = {}
     for pieces in world.gather(mine, root=0) or ():
-        found.update(pieces)
-    parts = {k: one for k in sorted(found) if not isinstance(one := found[k], InputError)}
+        results.update(pieces)
+    parts = {k: part for k in sorted(results) if not isinstance(part := results[k], InputError)}
     with together(world):
-        if len(parts) < len(found):
-            failed = [str(one) for one in found.values() if isinstance(one, InputError)]
+        if len(parts) < len(results):
+            failed = [str(part) for part in results.values() if isinstance(part, InputError)]
             raise PartsError("; ".join(failed), parts)
     return parts
 
@@ -284,6 +284,6 @@ def mesh_parts(parts: Mapping[int, Part], coarse: bool = True) -> Meshes:
     """
     larger: dict[int, PartMesh] = {}
     with suppress(InputError):  # of walls thinner than such cells
-        larger = {k: one.mesh(one.COARSER, ()) for k, one in parts.items() if coarse}
-    fine = {k: one.mesh() for k, one in parts.items()}
+        larger = {k: part.mesh(part.COARSER, ()) for k, part in parts.items() if coarse}
+    fine = {k: part.mesh() for k, part in parts.items()}
     return Meshes(larger if len(larger) == len(fine) else {}, fine)

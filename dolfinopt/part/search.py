@@ -297,7 +297,7 @@ class Search:
         led = None if solved is None else self._led_to(state, solved[0] * far)
         if solved is None or led is None:
             return None
-        (x, dual), (after, whole, anew) = solved, led
+        (x, dual), (after, total, anew) = solved, led
 
         def missed(values: np.ndarray) -> float:
             return float(np.maximum(values[:m], 0.0).sum() + values[m:].max(initial=0.0))
@@ -305,7 +305,7 @@ class Search:
         promised = float(-g @ x - 0.5 * x @ H @ x + price * (missed(f) - missed(f + F @ x)))
         fall = self._merit(state, state) - self._merit(after, state)
         places = dict(zip(keys, dual[m:], strict=True))
-        return Step(promised, dual[:m], places, after, whole, anew, fall)
+        return Step(promised, dual[:m], places, after, total, anew, fall)
 
     def _merit(self, state: State, held: State) -> float:
         v, price = state.against(held.held), self.price * abs(held.values[0])
@@ -314,7 +314,7 @@ class Search:
 
     def _led_to(self, state: State, x: np.ndarray) -> tuple[State, np.ndarray, bool] | None:
         """Return the state after a step, the whole step, and whether its meshes are new."""
-        after, whole = dict[int, FreeSides](), []
+        after, total = dict[int, FreeSides](), []
         ends = np.cumsum([outline.count for outline in state.outlines.values()])
         try:
             for (k, outline), part in zip(state.outlines.items(), np.split(x, ends[:-1])):
@@ -322,7 +322,7 @@ class Search:
                 if near is None:
                     return None
                 after[k] = near[0]
-                whole.append(part + near[1])
+                total.append(part + near[1])
             every = self.problem.every(after)
             bodies = {k: item.followed(state.bodies[k]) for k, item in every.items()}
             followed = {k: body for k, body in bodies.items() if body is not None}
@@ -330,4 +330,4 @@ class Search:
             result = self.problem.evaluated(after, {} if anew else followed, state.solutions)
         except (BrokenError, ConvergenceError, InputError):
             return None
-        return result, np.concatenate(whole), anew
+        return result, np.concatenate(total), anew

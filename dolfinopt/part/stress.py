@@ -86,7 +86,7 @@ def stress_of_parts(
     """
     scene = next(iter(arms.values())).scene
     motions = motions_of(trajectory)
-    found: dict[int, PartStress] = {}
+    result: dict[int, PartStress] = {}
     for k, loads in arm_loads(scene, motions).items():
         if not arms[k].solid.law.has_strength:
             continue
@@ -94,13 +94,13 @@ def stress_of_parts(
         points = parts[k].stress(state)
         counts = parts[k].regular(points.places, scene.objective.stress_margin)
         peaks: dict[int, tuple[Peak, ArmLoads]] = {}
-        for one in loads:
-            best = points.peak(one.coefficients, motions[one.motion].t, np.flatnonzero(counts))
-            if one.place not in peaks or best.value > peaks[one.place][0].value:
-                peaks[one.place] = best, one
-        for place, (best, one) in peaks.items():
-            found[place] = _worst_of(points, counts, best, one, motions[one.motion].t)
-    return found
+        for load in loads:
+            best = points.peak(load.coefficients, motions[load.motion].t, np.flatnonzero(counts))
+            if load.place not in peaks or best.value > peaks[load.place][0].value:
+                peaks[load.place] = best, load
+        for place, (best, load) in peaks.items():
+            result[place] = _worst_of(points, counts, best, load, motions[load.motion].t)
+    return result
 
 
 def _worst_of(
@@ -117,13 +117,13 @@ def _worst_of(
     """
     at, when = maxima(MPI.COMM_SELF, points.A, loads.coefficients)
     top = int(at.argmax())
-    whole = Peak(float(at[top]), tuple(map(float, points.places[top])), float(t[when[top]]))
+    everywhere = Peak(float(at[top]), tuple(map(float, points.places[top])), float(t[when[top]]))
     hot = points.places[counts & (at > HOT * best.value)]
     # What has no limit would be all that the colours show.
     at[~counts] = np.minimum(at[~counts], best.value)
     worst = at[points.corners].argmax(axis=1)
     node = points.corners[np.arange(len(worst)), worst]
-    return PartStress(best, whole, hot, ArmStress(best, whole, at[node], t[when[node]]))
+    return PartStress(best, everywhere, hot, ArmStress(best, everywhere, at[node], t[when[node]]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +220,7 @@ def mean_at_corners(
     shares = area / np.bincount(corners.ravel(), area, len(points))[corners.ravel()]
     columns = np.arange(corners.size)
     mean = sp.csr_matrix((shares, (corners.ravel(), columns)), (len(points), corners.size))
-    A = np.stack([mean @ one for one in own])
+    A = np.stack([mean @ component for component in own])
     shares = shares.reshape(corners.shape)
     return CornerStress(fields, A, outer.astype(float), points, corners, vertices, own, shares)
 
@@ -351,10 +351,10 @@ def singular_edges(domain: SolidDomain) -> np.ndarray:
     for value, some in ((1, domain.inboard), (2, domain.outboard)):
         kind[cKDTree(some.mean(axis=1)).query(centre)[0] < 1e-9 * domain.cell] = value
     edges, pairs = neighbours(nodes)
-    one, other = pairs.T
+    first, other = pairs.T
     # Re-entrant: the neighbour rises above the plane of the face.
-    rise = (normal[one] * (centre[other] - centre[one])).sum(axis=1)
-    turn = np.linalg.norm(np.cross(normal[one], normal[other]), axis=1)
-    size = np.linalg.norm(centre[other] - centre[one], axis=1)
+    rise = (normal[first] * (centre[other] - centre[first])).sum(axis=1)
+    turn = np.linalg.norm(np.cross(normal[first], normal[other]), axis=1)
+    size = np.linalg.norm(centre[other] - centre[first], axis=1)
     sharp = (turn > REENTRANT_SINE) & (rise > 0.1 * size)
-    return np.asarray(points[edges[sharp | (kind[one] != kind[other]), 0]])
+    return np.asarray(points[edges[sharp | (kind[first] != kind[other]), 0]])

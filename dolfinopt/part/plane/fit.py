@@ -445,15 +445,15 @@ def _goes_on(a: Side, b: Side) -> bool:
 def _whole(half: Sequence[Drawn], names: Iterator[int]) -> list[Drawn]:
     """Return the sides of a whole loop from those of its upper half."""
     # The first and the last may cross the axis: circles about it, and lines, which become upright.
-    made = [_crossing(item) if k in (0, len(half) - 1) else item for k, item in enumerate(half)]
-    made = [item if item.side.twin >= 0 else item.named(twin=next(names)) for item in made]
-    whole = made + [item.mirrored() for item in reversed(made) if item.side.key != item.side.twin]
+    upper = [_crossing(item) if k in (0, len(half) - 1) else item for k, item in enumerate(half)]
+    upper = [item if item.side.twin >= 0 else item.named(twin=next(names)) for item in upper]
+    sides = upper + [item.mirrored() for item in reversed(upper) if item.side.key != item.side.twin]
     # A side across the axis begins, or ends, at the mirror image of its other end.
-    if len(half) > 1 and made[0].side.key == made[0].side.twin:
-        whole[0] = replace(made[0], start=made[0].end * MIRROR)
-    if made[-1].side.key == made[-1].side.twin:
-        whole[len(made) - 1] = replace(made[-1], end=made[-1].start * MIRROR)
-    return whole
+    if len(half) > 1 and upper[0].side.key == upper[0].side.twin:
+        sides[0] = replace(upper[0], start=upper[0].end * MIRROR)
+    if upper[-1].side.key == upper[-1].side.twin:
+        sides[len(upper) - 1] = replace(upper[-1], end=upper[-1].start * MIRROR)
+    return sides
 
 
 def _crossing(drawn: Drawn) -> Drawn:

@@ -82,15 +82,15 @@ class FreeSides:
 
     def simplified(self) -> tuple[FreeSides, int]:
         """Return it without what its limits hold at its least, and how many such things went."""
-        made, number = self, 0
+        simpler, number = self, 0
         while True:
-            for sides in simplifications(made.sides, self.limits, self.part.domain.outer_edges):
-                result = replace(made, sides=sides).nearest()
-                if result is not None and result[0].count < made.count:
-                    made, number = result[0], number + 1
+            for sides in simplifications(simpler.sides, self.limits, self.part.domain.outer_edges):
+                result = replace(simpler, sides=sides).nearest()
+                if result is not None and result[0].count < simpler.count:
+                    simpler, number = result[0], number + 1
                     break
             else:
-                return made, number
+                return simpler, number
 
     def moved(self, x: np.ndarray) -> FreeSides:
         """Return it after a step x.
@@ -158,12 +158,12 @@ class FreeSides:
         for i, loop in enumerate(self.sides.loops):
             sides = []
             for k, side in enumerate(loop.sides):
-                made = _stretched(side, factors)
-                sides.append(made)
+                image = _stretched(side, factors)
+                sides.append(image)
                 if (at := self.sides.numbers[1].get((i, k))) is not None:
                     along = factors * unit(side.angle)
                     out = factors * -left(unit(side.angle))
-                    ratio[at] = out @ -left(unit(made.angle))
+                    ratio[at] = out @ -left(unit(image.angle))
                     ratio[at + 1] = factors.prod() / (along @ along)
             corners = [replace(c, place=c.place * factors) for c in loop.corners]
             loops.append(Loop(tuple(sides), tuple(corners)))
@@ -172,8 +172,8 @@ class FreeSides:
             at = self.sides.of_circles + 3 * k
             ratio[at : at + 2] = factors
         # Not centred: its sides turn about the images of the other's middles.
-        made = replace(self.sides, loops=tuple(loops), circles=circles)
-        return replace(self, part=part, sides=made, repeated=ratio[:, None] * self.sides.ties)
+        image = replace(self.sides, loops=tuple(loops), circles=circles)
+        return replace(self, part=part, sides=image, repeated=ratio[:, None] * self.sides.ties)
 
     # -- what a killed search goes on from ---------------------------------------------------
 
@@ -217,8 +217,8 @@ class FreeSides:
         circles = [
             Circle(row[2:4], float(row[4]), int(row[0]), int(row[1])) for row in arrays["circles"]
         ]
-        made = replace(self.sides, loops=tuple(loops), circles=tuple(circles))
-        return replace(self, sides=made.centred())
+        outline = replace(self.sides, loops=tuple(loops), circles=tuple(circles))
+        return replace(self, sides=outline.centred())
 
 
 def _ways(curve: Curve) -> list[Curve]:

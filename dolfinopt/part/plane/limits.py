@@ -171,7 +171,7 @@ class Limits:
             sides: where to begin.
             area: that it shall have besides, m2.
         """
-        whole = np.zeros(sides.count)
+        total = np.zeros(sides.count)
         for _ in range(STEPS):
             try:
                 g, A = self.rows(sides)
@@ -183,13 +183,13 @@ class Limits:
                     g, margin = np.append(g, missing), np.append(margin, [0.0, 0.0])
                     A = np.vstack([A, np.outer([-1.0, 1.0], slope / whole_slope)])
                 if g.max(initial=-1.0) < KEPT:
-                    return (sides, whole) if self.is_simple(sides) else None
+                    return (sides, total) if self.is_simple(sides) else None
                 some = g > -FAR * self.cell
                 result = least_move(A[some], -g[some] - margin[some], self.cell)
                 if result is None or (size := np.abs(result[0]).max()) > 6.0 * FAR * self.cell:
                     return None
                 x = result[0] * min(1.0, FAR * self.cell / size)
-                sides, whole = sides.moved(sides.ties @ x), whole + x
+                sides, total = sides.moved(sides.ties @ x), total + x
             except BrokenError:
                 return None
         return None
@@ -243,7 +243,7 @@ def rounded_radii(sides: Sides, limits: Limits) -> Sides:
     Where that cannot be, the radii stay as they are.
     """
 
-    def whole(radius: float) -> float:
+    def rounded(radius: float) -> float:
         steps = round(radius / HALF), np.ceil(limits.tool / HALF - 1e-9), 1
         return float(HALF * max(steps))
 
@@ -251,14 +251,14 @@ def rounded_radii(sides: Sides, limits: Limits) -> Sides:
         replace(
             loop,
             corners=tuple(
-                replace(c, radius=whole(c.radius)) if c.radius > 0.0 else c for c in loop.corners
+                replace(c, radius=rounded(c.radius)) if c.radius > 0.0 else c for c in loop.corners
             ),
         )
         for loop in sides.loops
     )
-    circles = tuple(replace(circle, radius=whole(circle.radius)) for circle in sides.circles)
-    made = replace(sides, loops=loops, circles=circles, holds_radii=True)
-    result = limits.nearest(made, area=sides.shape.area) or limits.nearest(made)
+    circles = tuple(replace(circle, radius=rounded(circle.radius)) for circle in sides.circles)
+    even = replace(sides, loops=loops, circles=circles, holds_radii=True)
+    result = limits.nearest(even, area=sides.shape.area) or limits.nearest(even)
     return sides if result is None else replace(result[0], holds_radii=False)
 
 
@@ -371,8 +371,8 @@ def _together(every: list[Placed], sides: Sides) -> np.ndarray:
     side = np.array([item.side for item in every])
     size = np.array([len(sides.loops[i].sides) if i >= 0 else 1 for i in loop])
     steps = (side[:, None] - side) % size[:, None]
-    beside = (steps <= 1) | (steps == size[:, None] - 1)
-    result = (loop[:, None] == loop) & (loop >= 0) & beside
+    adjacent = (steps <= 1) | (steps == size[:, None] - 1)
+    result = (loop[:, None] == loop) & (loop >= 0) & adjacent
     stays = np.array([item.moves is None for item in every])
     return result | (stays[:, None] & stays) | np.eye(len(every), dtype=bool)
 

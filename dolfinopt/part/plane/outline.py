@@ -192,8 +192,8 @@ def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
 
     def excess(level: float) -> float:
         above = shapely.simplify(raster.above(level), CHORD * domain.cell)
-        whole = shapely.union_all([above.intersection(limits.arm), stays])
-        result = _at(domain, limits, _linked(whole, links, CHORD * domain.cell), stays, level)
+        material = shapely.union_all([above.intersection(limits.arm), stays])
+        result = _at(domain, limits, _linked(material, links, CHORD * domain.cell), stays, level)
         tried.append(result)
         return 0.0 if off(result) < AREA else result.area - volume
 
@@ -214,37 +214,39 @@ def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
     )
 
 
-def _linked(whole: Geometry, links: Geometry, near: float) -> Geometry:
+def _linked(material: Geometry, links: Geometry, near: float) -> Geometry:
     """Return material with the links that join it in two places or more."""
     import shapely
 
-    missing = shapely.buffer(shapely.get_parts(links.difference(whole)), near)
-    joins = [len(polygons_of(item)) > 1 for item in shapely.intersection(missing, whole)]
-    return shapely.union_all([whole, *missing[joins]])
+    missing = shapely.buffer(shapely.get_parts(links.difference(material)), near)
+    joins = [len(polygons_of(item)) > 1 for item in shapely.intersection(missing, material)]
+    return shapely.union_all([material, *missing[joins]])
 
 
-def _narrow(whole: Geometry, width: float, near: float) -> tuple[np.ndarray, np.ndarray]:
+def _narrow(material: Geometry, width: float, near: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the pieces (n,) that are narrower than a width, m, and how many wider ones each joins.
 
     Args:
-        whole: polygons (shapely).
+        material: polygons (shapely).
         width: m.
         near: distance within which pieces touch, m.
     """
     import shapely
 
-    wide = whole.buffer(-0.5 * width).buffer(0.5 * width + near)
-    pieces = shapely.get_parts(whole.difference(wide))
+    wide = material.buffer(-0.5 * width).buffer(0.5 * width + near)
+    pieces = shapely.get_parts(material.difference(wide))
     pieces = shapely.buffer(pieces[shapely.area(pieces) > SMALLEST * width**2], 3.0 * near)
     joined = [len(polygons_of(item)) for item in shapely.intersection(pieces, wide)]
     return pieces, np.array(joined, dtype=int)
 
 
-def _at(domain: Domain, limits: Limits, whole: Geometry, stays: Geometry, level: float) -> Outline:
+def _at(
+    domain: Domain, limits: Limits, material: Geometry, stays: Geometry, level: float
+) -> Outline:
     """Return the outline at a level of what is above it."""
     import shapely
 
-    before = polygons_of(whole)
+    before = polygons_of(material)
     closed = shapely.union_all(before).buffer(limits.tool).buffer(-limits.tool)
     filled = shapely.union_all([*before, closed]).intersection(limits.arm)
     near = CHORD * domain.cell
@@ -253,8 +255,8 @@ def _at(domain: Domain, limits: Limits, whole: Geometry, stays: Geometry, level:
     widened = shapely.union_all([filled, *necks]).intersection(limits.arm)
     parts, ends = polygons_of(widened), interfaces(domain)
     touch = 1e-6 * domain.extent
-    whole = [p for p in parts if all(p.distance(end) < touch for end in ends)]
-    main = max(whole, key=lambda p: p.area, default=shapely.Polygon())
+    joining = [p for p in parts if all(p.distance(end) < touch for end in ends)]
+    main = max(joining, key=lambda p: p.area, default=shapely.Polygon())
     dropped = [p for p in parts if p is not main]
     holes = sum(len(p.interiors) for p in before) - sum(len(p.interiors) for p in parts)
     area = float(sum(p.area for p in dropped))

@@ -331,8 +331,8 @@ class Sides:
             for i in range(len(self.loops))
         ]
         rings = [(item.piece,) for item in self.placed if item.loop < 0]
-        whole = [*loops, *rings, *self.fixed]
-        return Shape(tuple(sorted(whole, key=_enclosed, reverse=True)))
+        every = [*loops, *rings, *self.fixed]
+        return Shape(tuple(sorted(every, key=_enclosed, reverse=True)))
 
     @cached_property
     def placed(self) -> list[Placed]:
@@ -390,8 +390,8 @@ class Sides:
     def _meeting(self, i: int, k: int) -> _Meeting:
         """Return a corner's centre with derivatives, and where it touches the sides beside it."""
         loop, (count, of_sides, of_corners) = self.loops[i], self.numbers
-        corner, beside = loop.corners[k], ((k - 1) % len(loop.sides), k)
-        a, b = (loop.sides[j] for j in beside)
+        corner, pair = loop.corners[k], ((k - 1) % len(loop.sides), k)
+        a, b = (loop.sides[j] for j in pair)
         radius, by_radius = corner.radius, np.zeros(count)
         if radius > 0.0:
             by_radius[of_corners[i, k]] = 1.0
@@ -399,7 +399,7 @@ class Sides:
         centre = corner.place if stays else meet(a, b, radius, corner.place)
         by_centre, feet = np.zeros((2, count)), (a.foot(centre), b.foot(centre))
         rows, angles = [], []
-        for j, side, (foot, along, _) in zip(beside, (a, b), feet, strict=True):
+        for j, side, (foot, along, _) in zip(pair, (a, b), feet, strict=True):
             row, angle = by_radius.copy(), np.zeros(count)
             if side.free:
                 at = of_sides[i, j]
@@ -428,7 +428,7 @@ class Sides:
         _, sides, corners = self.numbers
         loops = []
         for i, loop in enumerate(self.loops):
-            made = tuple(
+            moved = tuple(
                 side.moved(*q[at : at + 2]) if (at := sides.get((i, k), -1)) >= 0 else side
                 for k, side in enumerate(loop.sides)
             )
@@ -438,7 +438,7 @@ class Sides:
                 else corner
                 for k, corner in enumerate(loop.corners)
             )
-            loops.append(Loop(made, rounded))
+            loops.append(Loop(moved, rounded))
         steps = q[self.of_circles :].reshape(-1, 3)
         circles = tuple(
             replace(circle, centre=circle.centre + step[:2], radius=circle.radius + step[2])

@@ -82,7 +82,9 @@ def surface_at(
     for name, at_corners in (fields or {}).items():
         at_nodes[name] = np.empty((len(points), *at_corners.shape[2:]))
         at_nodes[name][_numbers(corners)[1]] = at_corners
-    return _cut(points, nodes, values, level, at_nodes)
+    surface, result = outside(cut(points, nodes, values, level, at_nodes))
+    carried = {name: result[name].reshape(-1, *item.shape[1:]) for name, item in at_nodes.items()}
+    return replace(surface, fields=carried)
 
 
 def _numbers(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -100,13 +102,16 @@ def nodal_densities(
         corners, density: as for `surface_at`.
     """
     points, nodes = _numbers(corners)
-    nodes = _right_handed(corners, nodes)
-    sizes = cell_sizes(corners)
-    weight, total = np.zeros((2, len(points)))
-    for node in nodes.T:
-        np.add.at(weight, node, sizes)
-        np.add.at(total, node, sizes * density)
-    return points, nodes, total / weight
+    return points, _right_handed(corners, nodes), _averaged(nodes, cell_sizes(corners), density)
+
+
+def _averaged(nodes: np.ndarray, sizes: np.ndarray, density: np.ndarray) -> np.ndarray:
+    """Return the densities (k,) at nodes from those of cells (n,), weighted by their sizes."""
+    weight, total = (
+        np.bincount(nodes.ravel(), np.repeat(item, nodes.shape[1]))
+        for item in (sizes, sizes * density)
+    )
+    return total / weight
 
 
 def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -129,13 +134,7 @@ def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.nda
     for axis in (1, 2, 3):
         _centre_faces(grid, corners, axis)
     points, nodes = _numbers(grid.reshape(-1, 27, 3))
-    nodes = np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[27]], nodes)
-    sizes = cell_sizes(corners)
-    weight, total = (
-        np.bincount(nodes.ravel(), np.repeat(item, 27), len(points))
-        for item in (sizes, sizes * density)
-    )
-    return points, nodes, total / weight
+    return points, _right_handed(corners, nodes), _averaged(nodes, cell_sizes(corners), density)
 
 
 def middles(faces: np.ndarray) -> np.ndarray:
@@ -188,28 +187,10 @@ def _centre_faces(grid: np.ndarray, corners: np.ndarray, axis: int) -> None:
 
 
 def _right_handed(corners: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Return the nodes of cells, those of left-handed ones in another order."""
-    return np.where(_left_handed(corners)[:, None], nodes[:, MIRRORED[nodes.shape[1]]], nodes)
-
-
-def _left_handed(corners: np.ndarray) -> np.ndarray:
-    """Tell which cells (n, 4 or 8, 3) are left-handed."""
+    """Return nodes (n, ...) of cells with corners (n, 4 or 8, 3), left-handed ones mirrored."""
     edges = corners[:, [1, 2, 3 if corners.shape[1] == 4 else 4]] - corners[:, :1]
-    return np.asarray(np.linalg.det(edges) < 0.0)
-
-
-def _cut(
-    points: np.ndarray,
-    nodes: np.ndarray,
-    values: np.ndarray,
-    level: float,
-    fields: Mapping[str, np.ndarray] | None = None,
-) -> Surface:
-    """Return the surface of what of the cells is above a level."""
-    fields = fields or {}
-    surface, result = outside(cut(points, nodes, values, level, fields))
-    carried = {name: result[name].reshape(-1, *item.shape[1:]) for name, item in fields.items()}
-    return replace(surface, fields=carried)
+    mirrored = nodes[:, MIRRORED[nodes.shape[1]]]
+    return np.where((np.linalg.det(edges) < 0.0)[:, None], mirrored, nodes)
 
 
 def cut(
@@ -541,11 +522,11 @@ def at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:
     field, target, tried = _field(domain), domain.volume, list[tuple[float, float, Any, Any]]()
 
     def excess(level: float) -> float:
-        whole = field.above(level)
-        joined = _joined(whole)
+        above = field.above(level)
+        joined = _joined(above)
         off = (0.0 if joined is None else outside(joined)[0].volume) - target
         if joined is not None:
-            tried.append((abs(off), level, whole, joined))
+            tried.append((abs(off), level, above, joined))
         return 0.0 if abs(off) <= NEAR * target else off
 
     with suppress(ValueError):  # whatever the level the volume is too large, or too small
@@ -555,9 +536,9 @@ def at_volume(domain: SolidDomain) -> tuple[float, Any, int, float]:
             f"arm {domain.name!r}: its design does not hang together: no material joins both "
             "interfaces; optimise longer, or with a larger design.volume_fraction"
         )
-    _, level, whole, joined = min(tried, key=lambda item: item[0])
-    count = _number_of_pieces(whole) - _number_of_pieces(joined)
-    lost = outside(whole)[0].volume - outside(joined)[0].volume if count else 0.0
+    _, level, above, joined = min(tried, key=lambda item: item[0])
+    count = _number_of_pieces(above) - _number_of_pieces(joined)
+    lost = outside(above)[0].volume - outside(joined)[0].volume if count else 0.0
     return level, joined, count, lost
 
 
