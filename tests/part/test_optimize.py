@@ -17,6 +17,7 @@ from dolfinopt.cli.shared import scene_of
 from dolfinopt.part.optimize import Descent, _free, optimize_parts
 from dolfinopt.part.part import Curves, make_parts
 from dolfinopt.part.plane.curves import MIRROR, Arc, Line
+from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import Search
@@ -337,6 +338,9 @@ def test_truss_has_interfaces_and_area_of_the_part(truss):
     assert len(ends) == 2
     np.testing.assert_allclose([e[1:] for e in others], [e[1:] for e in ends], atol=1e-9)
     assert len(made.shape.loops) > 5 and made.shape.is_simple(1e-5)
+    free = FreeSides(made, made.sides, None)
+    outer = free.sides.loops[0], free.restored(free.arrays).sides.loops[0]
+    np.testing.assert_allclose(*([s.curve.start for s in o.sides if s.curve] for o in outer))
 
 
 def test_number_of_a_truss_is_another_length_of_bays(truss):

@@ -62,7 +62,7 @@ SPACE = ("arms.link1.cells=[5,1,1]", "arms.link2.cells=[5,1,1]", "arms.passive=0
 
 
 @pytest.mark.parametrize("base", ["two_arm", "controlled_two_arm", "spatial_arm"])
-def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
+def test_gradient_by_nodes(base, tmp_path, monkeypatch):
     """Remainders are of second order; a node in the middle of the solid counts nothing."""
     monkeypatch.setattr("dolfinopt.responses.stress.NEGLIGIBLE_POWER_SHARE", 0.0)
     (tmp_path / "bar.geo").write_text(BAR)
@@ -70,10 +70,10 @@ def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
     told = (f"arms.mesh='{tmp_path}/bar.geo'", *PLANE) if plane else SPACE
     scene = do.load_scene(ROOT / "demos" / f"{base}.toml", (*ROUGHLY, *told, kind))
 
-    def middle(length: float, places: np.ndarray) -> np.ndarray:  # cells end at twelfths, fifths
+    def middle(length, places):  # cells end at twelfths, fifths
         return (places[:, 0] > 0.15 * length) & (places[:, 0] < 0.85 * length)
 
-    def points(k: int, state):
+    def points(k, state):
         every = corner_stress(state)
         return every.counted(middle(scene.arms[k].length, every.places))
 
@@ -84,12 +84,12 @@ def test_gradient_by_nodes(base, tmp_path, monkeypatch) -> None:
     assert found.rate == pytest.approx(2.0, abs=0.1)
 
 
-def solid(k: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def solid(k, x, y):
     """Return densities of solid material."""
     return np.ones_like(x)
 
 
-def test_largest_is_that_of_the_part(tmp_path) -> None:
+def test_largest_is_that_of_the_part(tmp_path):
     """As the check of a part finds it; the p-mean is below."""
     folder = folder_with(tmp_path / "run", frame, "arms.cells=[100,6]", "simulation.sample=0.005")
     scene = scene_of(folder)
@@ -97,7 +97,7 @@ def test_largest_is_that_of_the_part(tmp_path) -> None:
     state = simulate_parts(scene, parts, mesh_parts(parts).coarse)
     known = stress_of_parts(state.arms, state.trajectory, parts)
 
-    def points(k: int, design):
+    def points(k, design):
         every = parts[k].stress(design)
         return every.counted(parts[k].regular(every.places, scene.objective.stress_margin))
 

@@ -102,16 +102,13 @@ def nodal_densities(
         corners, density: as for `surface_at`.
     """
     points, nodes = _numbers(corners)
-    return points, _right_handed(corners, nodes), _averaged(nodes, cell_sizes(corners), density)
-
-
-def _averaged(nodes: np.ndarray, sizes: np.ndarray, density: np.ndarray) -> np.ndarray:
-    """Return the densities (k,) at nodes from those of cells (n,), weighted by their sizes."""
-    weight, total = (
-        np.bincount(nodes.ravel(), np.repeat(item, nodes.shape[1]))
-        for item in (sizes, sizes * density)
-    )
-    return total / weight
+    nodes = _right_handed(corners, nodes)
+    sizes = cell_sizes(corners)
+    weight, total = np.zeros((2, len(points)))
+    for node in nodes.T:
+        np.add.at(weight, node, sizes)
+        np.add.at(total, node, sizes * density)
+    return points, nodes, total / weight
 
 
 def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -134,7 +131,12 @@ def halved(corners: np.ndarray, density: np.ndarray) -> tuple[np.ndarray, np.nda
     for axis in (1, 2, 3):
         _centre_faces(grid, corners, axis)
     points, nodes = _numbers(grid.reshape(-1, 27, 3))
-    return points, _right_handed(corners, nodes), _averaged(nodes, cell_sizes(corners), density)
+    nodes, sizes = _right_handed(corners, nodes), cell_sizes(corners)
+    weight, total = (
+        np.bincount(nodes.ravel(), np.repeat(item, 27), len(points))
+        for item in (sizes, sizes * density)
+    )
+    return points, nodes, total / weight
 
 
 def middles(faces: np.ndarray) -> np.ndarray:
