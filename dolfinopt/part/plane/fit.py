@@ -107,11 +107,12 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
-    drawn = _drawn(outline, limits, tolerance)
-    with suppress(BrokenError):
-        result = limits.nearest(drawn, area=area) or limits.nearest(drawn)
-        if result is not None:
-            return result[0]
+    for halvings in range(HALVINGS):
+        drawn = _drawn(outline, limits, 0.5**halvings * tolerance)
+        with suppress(BrokenError):
+            result = limits.nearest(drawn, area=area) or limits.nearest(drawn)
+            if result is not None:
+                return result[0]
     raise InputError(
         f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
         "the outline; choose another --tolerance or a smaller --tool-radius"
