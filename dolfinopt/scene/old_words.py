@@ -217,8 +217,9 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
                     _refuse_both(row, word, source)
                 # A stated default counts where else another value would: the arm before's, or
                 # that of a guess.
-                known = word.new.rpartition(".")[2] in row
-                stated = not known if table == "arms" else known and word.value is _first_joint
+                known = word.new.rpartition(".")[2]
+                guessed = word.value is _first_joint and row.get(known) is not None
+                stated = known not in row if table == "arms" else guessed
                 if anew or not unset or stated:
                     word.put(tree, row, value)
             if not unset or (anew and word.new):

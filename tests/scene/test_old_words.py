@@ -45,3 +45,9 @@ def test_a_start_of_zero_counts_beside_a_guess():
     tree = read_scene(TWO_ARM, [*TURNS, "motion.initial_joints=[0.1, 2.0]"]).to_dict()
     tree["motion"]["start_angle"] = 0.0
     assert scene_from_dict(tree).motion.initial_joints == (0.0, 2.0)
+
+
+def test_a_run_folder_without_a_start_angle_is_read():
+    tree = read_scene(TWO_ARM).to_dict()
+    tree["motion"]["start_angle"] = 0.0
+    assert scene_from_dict(tree).motion.initial_joints is None
