@@ -677,7 +677,7 @@ class Model:
         """Return which ranks do which arm, and this rank's, meshed at first use (collective)."""
         if self._built is None:
             plane = self.scene.dimension == 2
-            partition = partition_arms(self._world, self.scene.cell_counts, whole=plane)
+            partition = partition_arms(self._world, self.scene.cell_counts, undivided=plane)
             arms = build_arms(self.scene, partition, self._profile)
             centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
             self._order = {k: canonical_order(points) for k, points in centroids.items()}

@@ -62,7 +62,9 @@ class Partition:
         return bool(self.arms) and self.comm.rank == 0
 
 
-def partition_arms(world: MPI.Comm, cells: Mapping[int, int], *, whole: bool = False) -> Partition:
+def partition_arms(
+    world: MPI.Comm, cells: Mapping[int, int], *, undivided: bool = False
+) -> Partition:
     """Deal arms with a design of their own out over the ranks of `world` (collective).
 
     Up to as many ranks as arms, whole arms are dealt out and need no communication. Further
@@ -73,14 +75,14 @@ def partition_arms(world: MPI.Comm, cells: Mapping[int, int], *, whole: bool = F
     Args:
         world: all ranks.
         cells: number of cells of every such arm, by its index in the scene.
-        whole: share no arm between ranks, however large, as plane arms: on two ranks MUMPS takes
-            longer than one rank's band.
+        undivided: share no arm between ranks, however large, as plane arms: on two ranks MUMPS
+            takes longer than one rank's band.
     """
     arms = sorted(cells)
     count, ranks = len(arms), range(world.size)
     colors = tuple(ranks)
     mine = arms[world.rank :: world.size]
-    if world.size > count and not whole and max(cells.values(), default=0) >= SPLIT_CELLS:
+    if world.size > count and not undivided and max(cells.values(), default=0) >= SPLIT_CELLS:
         colors = tuple(rank * count // world.size for rank in ranks)
         mine = [arms[colors[world.rank]]]
     return Partition(world=world, comm=_split(world, colors), arms=tuple(mine))

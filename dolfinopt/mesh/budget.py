@@ -31,7 +31,7 @@ def check_budget(world: MPI.Comm, scene: Scene) -> None:
     at the same time are not seen.
     """
     cells = scene.cell_counts
-    partition = partition_arms(world, cells, whole=scene.dimension == 2)
+    partition = partition_arms(world, cells, undivided=scene.dimension == 2)
     mine = RANK_BYTES
     for k in partition.arms:
         shared = SHARED_BYTES_RATIO if partition.comm.size > 1 and scene.arms[k].is_solid else 1.0

@@ -285,7 +285,7 @@ def arms_with_design(
     from dolfinopt.arms.arm import build_arms, uniform_design
     from dolfinopt.parallel import partition_arms
 
-    partition = partition_arms(world, scene.cell_counts, whole=scene.dimension == 2)
+    partition = partition_arms(world, scene.cell_counts, undivided=scene.dimension == 2)
     arms = build_arms(scene, partition, profile)
     if design is not None:
         return partition, arms, read_design(design, partition, arms)

@@ -181,7 +181,7 @@ def optimize(
 
         profile = Profile()
         if built is None:
-            partition = partition_arms(world, scene.cell_counts, whole=scene.dimension == 2)
+            partition = partition_arms(world, scene.cell_counts, undivided=scene.dimension == 2)
             built = partition, build_arms(scene, partition, profile)
         memory, recorder = None, None
         if folder is not None:

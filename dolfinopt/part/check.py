@@ -575,7 +575,7 @@ def refined(
         for place, item in stress.items():
             owner = scene.owners[place]
             if owner is not None and item.peak.value > HOT * column.values[STRESS]:
-                places[owner].append(item.hot)
+                places[owner].append(item.peaks)
         before = column
     return fine, column, stress, change, meshes
 

@@ -366,14 +366,14 @@ class Filled:
         return float(self.x_phys @ self.sizes)
 
     @property
-    def whole(self) -> float:
+    def full_volume(self) -> float:
         """All that material may fill; m3, m2."""
         return float(self.sizes.sum())
 
     @property
     def total(self) -> float:
         """Size of the arm with the cells that stay void; m3, m2."""
-        return self.whole
+        return self.full_volume
 
     @property
     def grayness(self) -> float:
@@ -593,7 +593,7 @@ class SolidDomain(Filled):
     @property
     def total(self) -> float:
         """See `Filled`."""
-        return self.whole + self.void
+        return self.full_volume + self.void
 
     @property
     def cell(self) -> float:

@@ -191,7 +191,7 @@ def make_parts(
     curves = Curves(scene.part.tool_radius, scene.part.tolerance) if curves is None else curves
     on_root(world, _check, folder, curves)
     check_budget(world, scene)
-    partition = partition_arms(world, scene.cell_counts, whole=True)
+    partition = partition_arms(world, scene.cell_counts, undivided=True)
     patterns = {k: scene.arms[pattern] for k, pattern in scene.patterns.items()}
     with together(world):
         meshes = {

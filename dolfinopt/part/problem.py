@@ -45,7 +45,7 @@ class State:
         means: p-mean, Pa, of the stress of each of them, which it follows while a mesh does.
         stress: of the arms' meshes.
         owners: (n,) number of the place of every node of them; -1: none.
-        hot: (n, d) nodes of the arms' meshes where a finer mesh is worth it, m.
+        peaks: (n, d) nodes of the arms' meshes where a finer mesh is worth it, m.
     """
 
     outlines: Mapping[int, FreeSides]
@@ -58,7 +58,7 @@ class State:
     means: Mapping[Place, float] = field(default_factory=dict)
     stress: Mapping[int, CornerStress] = field(default_factory=dict)
     owners: Mapping[int, np.ndarray] = field(default_factory=dict)
-    hot: Mapping[int, np.ndarray] = field(default_factory=dict)
+    peaks: Mapping[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def values(self) -> np.ndarray:
@@ -187,12 +187,14 @@ class Problem:
                 as_is = float(stress[here].max()) * factor / means[key]
                 places[key] = means[key] * self.local.get(key, as_is) - 1.0
         largest = max(float(stress.max()) for _, stress in stresses.values())
-        hot = {
+        peaks = {
             k: at[stress > HOT * stress.max()]
             for k, (at, stress) in stresses.items()
             if stress.max() > HOT * largest
         }
-        return replace(state, places=places, means=means, stress=corners, owners=owners, hot=hot)
+        return replace(
+            state, places=places, means=means, stress=corners, owners=owners, peaks=peaks
+        )
 
     def stress_slopes(self, state: State, keys: Sequence[Place]) -> list[np.ndarray]:
         """Return the derivatives (n,) of `State.places` of some places."""
@@ -224,7 +226,7 @@ class Problem:
             return problem, fine
         for _ in range(2):
             fresh, plain = fine, problem
-            finer = {k: (*plain.finer.get(k, ()), places) for k, places in fresh.hot.items()}
+            finer = {k: (*plain.finer.get(k, ()), places) for k, places in fresh.peaks.items()}
             problem = replace(plain, finer={**plain.finer, **finer})
             fine = problem.evaluated(state.outlines, {}, fresh.solutions)
         places = {key: fine.places.get(key, value) for key, value in fresh.places.items()}
@@ -253,7 +255,7 @@ class Problem:
         for outline in outlines.values():
             domain, t = outline.part.domain, outline.part.domain.thickness
             # What the densities have: sides may have begun a little above the limit.
-            most = max((share or 0.0) * domain.whole, domain.volume)
+            most = max((share or 0.0) * domain.full_volume, domain.volume)
             rows.append([t * outline.sides.shape.area, t * most])
             slopes.append(t * outline.area_by_x())
         every = np.hstack([rows, block_diag(*slopes)])

@@ -67,13 +67,13 @@ class Linear:
 
     Attributes:
         slopes: (1 + m, n) of the objective and of the limits but for the stress.
-        hot: derivatives (n,) of the stress of places.
+        stress: derivatives (n,) of the stress of places.
         A, b: of the geometry's limits, A x <= b.
         far: (n,) largest step, m.
     """
 
     slopes: np.ndarray
-    hot: Mapping[Place, np.ndarray]
+    stress: Mapping[Place, np.ndarray]
     A: np.ndarray
     b: np.ndarray
     far: np.ndarray
@@ -86,7 +86,7 @@ class Step:
     Attributes:
         promised: fall of the merit.
         multipliers: (m,) of limits; places: those of places.
-        state, whole: what it leads to, and the whole step (n,) with the way to a valid outline.
+        state, total: what it leads to, and the whole step (n,) with the way to a valid outline.
         anew: whether meshes were made anew.
         fall: of the merit.
     """
@@ -95,7 +95,7 @@ class Step:
     multipliers: np.ndarray
     places: Mapping[Place, float]
     state: State
-    whole: np.ndarray
+    total: np.ndarray
     anew: bool
     fall: float
 
@@ -244,9 +244,9 @@ class Search:
         change = slopes - old.slopes
         y = change[0] + step.multipliers @ change[1:]
         for key, price in step.places.items():
-            if key in self.rows and self.rows[key][1] == self.steps and key in old.hot:
-                y = y + price * (self.rows[key][0] - old.hot[key])
-        self.H = damped(self.H, step.whole, y)
+            if key in self.rows and self.rows[key][1] == self.steps and key in old.stress:
+                y = y + price * (self.rows[key][0] - old.stress[key])
+        self.H = damped(self.H, step.total, y)
 
     def _linear(self, state: State, slopes: np.ndarray) -> Linear:
         """Return the limits that a step of this radius can meet."""
@@ -257,8 +257,8 @@ class Search:
             A.append(own[near] / outline.cell)
             b.append(np.maximum(-g[near] / outline.cell, 0.0))
             far.append(np.full(outline.count, reach * outline.cell))
-        hot = {key: row for key, (row, _) in self.rows.items()}
-        return Linear(slopes, hot, block_diag(*A), np.concatenate(b), np.concatenate(far))
+        stress = {key: row for key, (row, _) in self.rows.items()}
+        return Linear(slopes, stress, block_diag(*A), np.concatenate(b), np.concatenate(far))
 
     def _tried(self, state: State, linear: Linear) -> Step | None:
         """Return the best of the trial steps of one radius; None: none makes parts."""
@@ -274,21 +274,21 @@ class Search:
                 key
                 for key in sorted(after, key=lambda k: -after[k])
                 if key in state.places
-                and (key not in linear.hot or self.rows[key][1] < self.steps)
+                and (key not in linear.stress or self.rows[key][1] < self.steps)
                 and after[key] > missed
             ]
             if step.fall >= ENOUGH * step.promised or not unknown:
                 break
             self._learn(state, unknown[:MOST])
-            linear = replace(linear, hot={key: row for key, (row, _) in self.rows.items()})
+            linear = replace(linear, stress={key: row for key, (row, _) in self.rows.items()})
         return max(tries, key=lambda item: item.fall, default=None)
 
     def _trial(self, state: State, linear: Linear) -> Step | None:
         """Return the step that the linear limits allow, and what it leads to; None: no parts."""
-        keys, base, far = list(linear.hot), state.against(state.held), linear.far
+        keys, base, far = list(linear.stress), state.against(state.held), linear.far
         m = len(base) - 1
         f = np.append(base[1:], [state.places[k] for k in keys])
-        F = np.vstack([linear.slopes[1:], *linear.hot.values()]) * far
+        F = np.vstack([linear.slopes[1:], *linear.stress.values()]) * far
         price = self.price * abs(base[0])
         slack = np.append(np.arange(m), np.full(len(keys), m)).astype(int)
         H = far[:, None] * self.H * far + 1e-6 * abs(base[0]) * np.eye(len(far))

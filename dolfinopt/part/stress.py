@@ -60,14 +60,14 @@ class PartStress:
     Attributes:
         peak: the largest away from every singular point.
         everywhere: the largest of all, singular points included.
-        hot: (n, d) where stress exceeds `HOT` times the peak, but at singular points, m.
+        peaks: (n, d) where stress exceeds `HOT` times the peak, but at singular points, m.
         cells: for pictures: the largest at any corner of every cell, and when; at singular
             points at most `peak`.
     """
 
     peak: Peak
     everywhere: Peak
-    hot: np.ndarray
+    peaks: np.ndarray
     cells: ArmStress
 
 
@@ -118,12 +118,12 @@ def _worst_of(
     at, when = maxima(MPI.COMM_SELF, points.A, loads.coefficients)
     top = int(at.argmax())
     everywhere = Peak(float(at[top]), tuple(map(float, points.places[top])), float(t[when[top]]))
-    hot = points.places[counts & (at > HOT * best.value)]
+    peaks = points.places[counts & (at > HOT * best.value)]
     # What has no limit would be all that the colours show.
     at[~counts] = np.minimum(at[~counts], best.value)
     worst = at[points.corners].argmax(axis=1)
     node = points.corners[np.arange(len(worst)), worst]
-    return PartStress(best, everywhere, hot, ArmStress(best, everywhere, at[node], t[when[node]]))
+    return PartStress(best, everywhere, peaks, ArmStress(best, everywhere, at[node], t[when[node]]))
 
 
 @dataclass(frozen=True, eq=False)

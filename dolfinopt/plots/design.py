@@ -41,7 +41,9 @@ LOW = 0.45  # inches, least height of an arm's axes
 SCALE_FOOT = 0.75  # inches, for the scale of colours
 LABEL_FOOT = 0.6  # inches, for the label of x
 MARGIN = 0.012  # of the arms' length, around them
-FACE = "#b8c4cc"  # of parts without densities
+PLATE = 1.0  # inches, likewise of a plate
+FACE, BRIGHT, DARK = "#b8c4cc", np.array([0.62, 0.68, 0.72]), np.array([0.20, 0.26, 0.31])
+DEPTH = np.array([0.35, 0.35])  # by which a plate's back is moved, of its thickness
 CHORD = 0.02  # of drawn curves, cells
 
 
@@ -163,6 +165,29 @@ def parts_figure(
     return figure
 
 
+@styled
+def figure_of_plates(parts: Sequence[PlanePart], densities: Sequence[float] = ()) -> Figure:
+    """Return a picture of parts as plates seen from the right and above, to one scale.
+
+    Args:
+        parts: below each other.
+        densities: of their material, kg/m3: captions then tell the masses.
+    """
+    boxes = [box_of(MILLI * part.domain.corners) for part in parts]
+    figure, rows = _arm_rows(boxes, "", "mm", 0.2, PLATE)
+    for k, (axes, part) in enumerate(zip(rows, parts, strict=True)):
+        loops, thickness = _loops(part), part.domain.thickness
+        _draw_plate(axes, loops, MILLI * thickness * DEPTH)
+        size = [*np.ptp(loops[0], axis=0), MILLI * thickness]
+        words = " \N{MULTIPLICATION SIGN} ".join(f"{length:.4g}" for length in size) + " mm"
+        if len(densities):
+            words += f", {densities[k] * part.shape.area * thickness:.3g} kg"
+        words += f", {len(loops) - 1} holes, {len(part.shape.curves)} curves"
+        axes.set_title(f"{part.domain.name}:  {words}")
+        axes.set_axis_off()
+    return figure
+
+
 def is_solid(views: Sequence[ArmView]) -> bool:
     """Return whether arms have three dimensions."""
     return bool(views[0].corners.shape[2] == 3)
@@ -224,12 +249,12 @@ def _flat(view: ArmView, point: np.ndarray) -> np.ndarray:
 
 
 def _arm_rows(
-    boxes: Sequence[Box], title: str, unit: str, foot: float
+    boxes: Sequence[Box], title: str, unit: str, foot: float, least: float = LOW
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure with axes for each plane arm, inboard joints in one column."""
     margin = MARGIN * max(float((high - low)[0]) for low, high in boxes)
     wider = [(low - margin, high + margin) for low, high in boxes]
-    figure, rows = stacked_axes(wider, title, below=0.12, foot=foot, least=LOW)
+    figure, rows = stacked_axes(wider, title, below=0.12, foot=foot, least=least)
     for axes in rows:
         axes.set_ylabel(f"y [{unit}]")
         axes.locator_params(axis="x", nbins=max(2, int(axes.bbox.width / 90.0)))
@@ -307,3 +332,16 @@ def boundary(corners: np.ndarray) -> np.ndarray:
     edge = np.sort(sides(node), axis=1) @ [node.max() + 1, 1]
     _, first, count = np.unique(edge, return_index=True, return_counts=True)
     return first[count == 1]
+
+
+def _draw_plate(axes: Axes, loops: Sequence[np.ndarray], depth: np.ndarray) -> None:
+    """Draw a plate: its sides, those of the holes above those of the outline, then its face."""
+    for loop in loops:
+        after = np.roll(loop, -1, axis=0)
+        quads: Any = np.stack([loop, after, after + depth, loop + depth], axis=1)
+        along = after - loop
+        normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
+        light = normal @ [0.6, 0.8] / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
+        shade: Any = 0.5 * (1.0 + light[:, None]) * (BRIGHT - DARK) + DARK
+        axes.add_collection(PolyCollection(quads, fc=shade, ec=shade, lw=0.4, clip_on=False))
+    axes.add_patch(PathPatch(_compound(loops), fc=FACE, ec="#20303a", lw=0.7, clip_on=False))
