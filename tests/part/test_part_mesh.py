@@ -29,9 +29,9 @@ def strip():
 
 @pytest.fixture(scope="module")
 def meshes():
-    """A coarse one, and one that is finer along the hole."""
+    """A coarse one, and one that is finer along the hole: twice, in 0.1 rad, as the check is."""
     hole = strip().loops[1][0].curve.at(np.linspace(0.0, 1.0, 65))
-    return body_mesh(strip(), 0.005), body_mesh(strip(), 0.005, finer=[hole])
+    return body_mesh(strip(), 0.005), body_mesh(strip(), 0.005, finer=[hole, hole])
 
 
 def test_area_is_that_of_the_curves(meshes):

@@ -233,8 +233,8 @@ def in_frame(arm: Arm, point: Point) -> Point:
     if (frame := frame_of(arm)) is None:
         return point
     origin, axes = frame
-    x, y, z = (axes @ (point - origin)).tolist()
-    return x, y, z
+    x, y, z = axes @ (point - origin)
+    return float(x), float(y), float(z)
 
 
 # -- gear, motor, bearing and friction: keys that [[arms]] and [[joints]] share -------------------
