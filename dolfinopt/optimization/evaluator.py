@@ -11,7 +11,7 @@ import numpy as np
 from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.optimization.problem import EvaluatedDesign
+from dolfinopt.optimization.problem import EvaluatedDesign, variants_of
 from dolfinopt.optimization.projection import Projection
 from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, together
@@ -52,7 +52,7 @@ class Evaluator:
         self.start: Start = (), {}
 
     def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
-        """Return what x stands for: eroded, dilated and nominal design, or the nominal one alone.
+        """Return what x stands for: those designs of which the problem is made, the nominal one last.
 
         Collective; of this rank's arms. From now on the scene has the law of x.
         """
@@ -61,11 +61,10 @@ class Evaluator:
         self.scene = self.scene.unchecked_copy({"motion": motion})
         with together(self.partition.world):
             designs = {k: arm.physical_designs(parts[k], beta) for k, arm in arms.items()}
-        count = 3 if self.scene.design.is_robust else 1
-        variants = [
-            {k: design[variant] for k, design in designs.items()} for variant in range(count)
+        return [
+            self._spread({k: design[variant] for k, design in designs.items()})
+            for variant in variants_of(self.scene)
         ]
-        return [self._spread(item) for item in variants]
 
     def _spread(self, designs: dict[int, PhysicalDesign]) -> dict[int, PhysicalDesign]:
         """Add the arms that repeat another's design, with its densities (collective)."""

@@ -38,7 +38,6 @@ class Iterate:
         best, progress: the best design so far, and the course of the iterations.
         iteration, change: updates made, and the largest change of a variable in the last one.
         reach: factor on the move limit, at most 1.
-        returned_to: iteration of the best design that was gone back to last, -1 of none.
         residual: of x.
         curved: whether limits other than volume and mass are to be kept.
         stuck: why no step leads on from x, "" while one does.
@@ -54,7 +53,7 @@ class Iterate:
         self.world = evaluator.partition.world
         self.x, self.state = x, initial_state(x)
         self.best, self.progress = Best.none(x), Progress()
-        self.iteration, self.change, self.reach, self.returned_to = 0, 0.0, 1.0, -1
+        self.iteration, self.change, self.reach = 0, 0.0, 1.0
         self.residual, self.stuck = Residual(np.nan, np.empty(0)), ""
         self.curved = bool(self.scene.limits.keys() - {"mass"})
 
@@ -87,19 +86,6 @@ class Iterate:
             return False
         self._restore_best()
         self._set(self.evaluator.evaluate(self.x))
-        return True
-
-    def begin_again(self) -> bool:
-        """Go on from the best design by shorter steps; return whether it is a new one (collective).
-
-        Each best design is gone back to once.
-        """
-        if self.problem.excess == 0.0 or self.best.iteration in (-1, self.returned_to):
-            return False
-        self.return_to_best()
-        self.returned_to = self.best.iteration
-        self.state, self.reach = initial_state(self.x), SHORTER_REACH**2
-        self.progress, self.stuck = self.progress.anew(), ""
         return True
 
     def begin_anew(self) -> bool:
@@ -270,7 +256,6 @@ class Iterate:
             iteration=self.iteration,
             change=self.change,
             reach=self.reach,
-            returned_to=self.returned_to,
             mma_steps=state.iteration,
             gradient=self.evaluator.scene.objective.gradient,
             cells=self.variables.split(np.column_stack(columns)),
@@ -295,7 +280,6 @@ class Iterate:
         for k, arm in self.evaluator.arms.items():
             arm.initial_vectors = memory.modes[k]
         self.iteration, self.change, self.reach = memory.iteration, memory.change, memory.reach
-        self.returned_to = memory.returned_to
         self.projection.beta = memory.beta
 
 

@@ -198,8 +198,6 @@ class _Run:
 
     def _goes_on(self) -> bool:
         """Look for what is still to be done where nothing is gained any more (collective)."""
-        if self.finished in (StopCode.SETTLED, StopCode.STUCK) and self.iterate.begin_again():
-            return True
         return self._uses_exact_gradient() or self._stiffens()
 
     def _uses_exact_gradient(self) -> bool:

@@ -6,8 +6,7 @@ Each with its unit and what it rules; problems as in `dolfinopt bench optimiser`
 
 # -- The step (iterate); figures of the sixteen problems in docs: theory/optimiser --
 
-# On the move limit where the merit rose; twice on a step without a motion or that leaps, and after
-# a return to the best design.
+# On the move limit where the merit rose; twice on a step without a motion or that leaps.
 SHORTER_REACH = 0.5
 REACH_GROWTH = 1.2  # on it where it did not
 LEAST_REACH = 0.05  # of the scene's move limit

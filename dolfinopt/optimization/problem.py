@@ -91,6 +91,19 @@ class Problem:
         return float(self.values[0] / size + LIMIT_PRICE * over)
 
 
+def variants_of(scene: Scene) -> list[int]:
+    """Return of which of `Arm.physical_designs` the problem is made, the nominal one last.
+
+    The dilated one, 1, where it is the worst of three, keeps limits, or gives members their width.
+    Without its motion the lightest arms take two thirds of the time.
+    """
+    if not scene.design.is_robust:
+        return [0]
+    design, of_nominal = scene.design, objective_of(scene).declared.of_nominal
+    spared = of_nominal and design.limits_nominal and not design.controls_widths
+    return [0, 2] if spared else [0, 1, 2]
+
+
 def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndarray, ...]:
     """Return the smooth limits of every design, as a step from here holds them.
 

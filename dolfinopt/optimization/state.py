@@ -166,7 +166,7 @@ class Memory:
     Attributes:
         iteration: design updates made.
         change: largest one in the last update.
-        reach, returned_to: factor on the move limit, and the design that was gone back to last.
+        reach: factor on the move limit.
         mma_steps: taken since the asymptotes began.
         gradient: in use, "exact" or "esl".
         cells: per arm (n_cells, k), and of the law: the variables and what MMA remembers of them.
@@ -187,7 +187,6 @@ class Memory:
     iteration: int
     change: float
     reach: float
-    returned_to: int
     mma_steps: int
     gradient: str
     cells: Mapping[int, np.ndarray]

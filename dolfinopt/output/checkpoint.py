@@ -32,7 +32,7 @@ SEAL = "digest"  # of all other arrays
 # Fields that the file has as JSON, which keeps every bit of a number: of `Memory`, and of its best
 # design; of a solution those that are arrays.
 PLAIN = (
-    "iteration", "change", "reach", "returned_to", "mma_steps", "gradient", "beta", "exact_from",
+    "iteration", "change", "reach", "mma_steps", "gradient", "beta", "exact_from",
 )  # fmt: skip
 BEST = "iteration", "beta", "objective", "excess", "crisp"
 SOLUTION = "time_grid", "nodes", "q", "qd", "a"
