@@ -52,7 +52,7 @@ class Evaluator:
         self.start: Start = (), {}
 
     def physical_designs(self, x: np.ndarray) -> list[dict[int, PhysicalDesign]]:
-        """Return what x stands for: those designs of which the problem is made, the nominal one last.
+        """Return those designs of x of which the problem is made, the nominal one last.
 
         Collective; of this rank's arms. From now on the scene has the law of x.
         """
