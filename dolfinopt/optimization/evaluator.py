@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.optimization.problem import EvaluatedDesign, variants_of
+from dolfinopt.optimization.problem import EvaluatedDesign, needs_gradient, variants_of
 from dolfinopt.optimization.projection import Projection
 from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, together
@@ -91,8 +92,8 @@ class Evaluator:
         self.start = self.solutions, {k: arm.initial_vectors for k, arm in self.arms.items()}
         *others, nominal = self.physical_designs(x)
         result = [
-            self.differentiated(other, self.evaluate_densities(densities(other)))
-            for other in others
+            self.differentiated(other, self.evaluate_densities(densities(other)), variant)
+            for variant, other in zip(variants_of(self.scene), others, strict=False)
         ]
         evaluation = self.evaluate_densities(densities(nominal))
         return [*result, EvaluatedDesign(nominal, evaluation)]
@@ -147,12 +148,20 @@ class Evaluator:
         return evaluation
 
     def differentiated(
-        self, design: Mapping[int, PhysicalDesign], evaluation: Evaluation
+        self,
+        design: Mapping[int, PhysicalDesign],
+        evaluation: Evaluation,
+        variant: int | None = None,
     ) -> EvaluatedDesign:
-        """Add the gradients by x of the design evaluated last (collective)."""
+        """Add the gradients by x of the design evaluated last (collective).
+
+        Of the nominal one, or as far as they count of another one of `variants_of`.
+        """
         if self.trajectory is not None:
             self.solutions = self.trajectory.solutions
-        rows = constraint_gradients(*self._analysed, evaluation.responses)
+        variant = variants_of(self.scene)[-1] if variant is None else variant
+        asked = partial(needs_gradient, self.scene, variant)
+        rows = constraint_gradients(*self._analysed, evaluation.responses, asked=asked)
         by_cells = [gradient(*self._analysed), *(row.smooth for row in rows)]
         by_x, limits = self._by_variables(design, by_cells), np.array([row.limit for row in rows])
         return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:] / limits[:, None])

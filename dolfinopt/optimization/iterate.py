@@ -135,15 +135,15 @@ class Iterate:
         """Go on to MMA's next design (collective).
 
         A step whose motion cannot be simulated, or that makes the objective or a limit twice as
-        bad, is made a quarter as long, three times; where that does not help, x stays and `stuck`
-        says why. The next steps are half as long where the merit rose, else longer again, but not
-        as long as the projection becomes steeper.
+        bad, is made without a steeper projection, then a quarter as long; after four attempts x
+        stays and `stuck` says why. The next steps are half as long where the merit rose, else
+        longer again, but not as long as the projection becomes steeper.
         """
         size = abs(self.problem.f0) or 1.0
         merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
         rises = self.projection.rises(self.problem.excess)
-        for attempt in range(STEP_ATTEMPTS):
-            shorter = SHORTER_REACH ** (2 * attempt)
+        shorter = 1.0
+        for _ in range(STEP_ATTEMPTS):
             new, after = self._proposed(shorter * self.reach * self.projection.move)
             if rises:
                 self.projection.advance()
@@ -156,8 +156,9 @@ class Iterate:
                 rose = self.problem.merit(size) > merit + EXCESS
                 self.reach = self._reach_after(shorter * self.reach, rises, rose)
                 return
-            self.projection.beta = before
-            rises = False  # the shorter step is one of the same projection
+            if not rises:
+                shorter *= SHORTER_REACH**2
+            self.projection.beta, rises = before, False
         self.evaluator.start = start
         self.evaluator.undo()
         self.evaluate_again()

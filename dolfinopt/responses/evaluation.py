@@ -6,7 +6,7 @@ eigenfrequency no simulation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -219,6 +219,7 @@ def constraint_gradients(
     profile: Profile | None = None,
     measured: Sequence[Measured] = (),
     by: By = by_design,
+    asked: Callable[[str], bool] = lambda _: True,
 ) -> list[ConstraintGradient]:
     """Return the gradients of `Evaluation.constraints` (collective).
 
@@ -227,13 +228,16 @@ def constraint_gradients(
             constraints of the motion alone.
         measured: `Evaluation.responses` of the design; measured anew if not given.
         by: as for `gradient`.
+        asked: whether the gradient of a response, by its name, is of any use; else it is left out.
     """
     analysis = analysis_of(scene, partition, arms, trajectory, profile or Profile(), by)
     result = []
     for k, bound in enumerate(constraints_of(scene), 1):
-        rows = bound.response.gradients(analysis)
         values = measured[k] if measured else bound.response.measure(analysis)
         limits = bound.smooth_limits(values)
+        rows: list[CellGradient] = [{} for _ in limits]
+        if asked(bound.response.name):
+            rows = bound.response.gradients(analysis)
         result += [
             ConstraintGradient(bound.response, row, float(limit))
             for row, limit in zip(rows, limits, strict=True)

@@ -160,7 +160,8 @@ def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
     make_folder(file.parent)
     write_text(file, "\n".join([",".join(["t", *scene.driven]), *lines, ""]))
     data = scene.to_tree()
-    kept = {key: data["motion"][key] for key in KEPT if key in data["motion"]}
+    keys = (*KEPT, "elbow") if scene.closures else KEPT  # which way a loop is closed
+    kept = {key: data["motion"][key] for key in keys if key in data["motion"]}
     if len(kept.get("initial_joints") or ()) == 1 and scene.motion.path == "rotation":
         del kept["initial_joints"]  # where the rotation began, which the table says
     horizon = scene.motion.horizon + shaper.longer

@@ -160,7 +160,7 @@ def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass(bound):
     scale = 1.0 / min(deviations[0] / deviations[-1], ERODED_LIMIT_FACTOR)
     expected = [scale * deviations[0] / 0.012 - 1.0, deviations[-1] / 0.012 - 1.0]
     assert own == pytest.approx(expected, rel=1e-9)
-    row = designs[0].of_nominal.tolist().index(False)
+    row = designs[0].limited.index("deviation")
     eroded, nominal = problem.dfdx[np.array(rows) == "deviation"]
     assert eroded == pytest.approx(scale * designs[0].constraints[row], rel=1e-9)
     assert nominal == pytest.approx(designs[-1].constraints[row], rel=1e-9)

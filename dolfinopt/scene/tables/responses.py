@@ -140,6 +140,7 @@ class Declaration:
         exact: whether equivalent static loads say nothing of it: its gradient is the exact one.
         lighter: whether it falls with the mass, down to that of no arm at all.
         of_nominal: whether a limit holds for the nominal one of robust designs alone.
+        of_phase: whether it depends on the phase of a vibration, which says nothing of softer arms.
         of_arms: whether there is nothing to measure without flexible arms.
         file: of `dolfinopt.responses`, with the class; "" of a class that is known already.
     """
@@ -156,6 +157,7 @@ class Declaration:
     exact: bool = False
     lighter: bool = False
     of_nominal: bool = False
+    of_phase: bool = False
     of_arms: bool = False
     file: str = ""
 
@@ -224,6 +226,7 @@ DECLARED: dict[str, Declaration] = {
                 "motion.dwells [m]",
                 Distance,
             ),
+            of_phase=True,
             file="motion",
         ),
         Declaration(
