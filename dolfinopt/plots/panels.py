@@ -84,14 +84,14 @@ def draw_panel(axes: Axes, panel: Panel, styles: Looks | None = None) -> None:
         log_scale(axes, y)
         if high <= NO_DIFFERENCE * low:
             axes.set_ylim(0.5 * low, 2.0 * high)
-    elif 0.0 <= low < (high if panel.y_log is False else 0.5 * high):
-        axes.set_ylim(bottom=0.0)
+    elif 0.0 <= low <= (high if panel.y_log is False else 0.5 * high) and high > 0.0:
+        axes.set_ylim(0.0, 1.05 * high)
     if low < 0.0 < high:
         axes.axhline(0.0, color="black", lw=0.6, zorder=1.0)
     if panel.x_log2 and len(x) and x.min() > 0.0:
         log2_scale(axes)
     elif len(x) and (x % 1 == 0).all() and not panel.log:
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
     if len(x) and not (panel.log or panel.x_log2):
         beside = 0.0 if len(x) > FEW_POINTS else 0.05 * np.ptp(x) or 0.5
         axes.set_xlim(x.min() - beside, x.max() + beside)

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from dolfinopt.part.hollow import HollowPart
-    from dolfinopt.part.solid.part import SolidPart
 
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
@@ -181,24 +179,15 @@ def draw_triad(axes: Axes, camera: Camera, at: np.ndarray, length: float) -> Non
         axes.text(x, y, name, ha="center", va="center", fontsize=9)
 
 
-def solid_parts_figure(
-    parts: Sequence[SolidPart | HollowPart], title: str, masses: Sequence[float]
+def surfaces_figure(
+    names: Sequence[str], surfaces: Sequence[Surface], notes: Sequence[Sequence[str]], title: str
 ) -> Figure:
-    """Return the picture of parts below each other, to one scale.
-
-    Args:
-        parts: of solid arms.
-        title: above the picture.
-        masses: of the parts, kg.
-    """
-    boxes = [(item.surface.points.min(axis=0), item.surface.points.max(axis=0)) for item in parts]
+    """Return the picture of parts below each other, to one scale, each under its size and notes."""
+    boxes = [(item.points.min(axis=0), item.points.max(axis=0)) for item in surfaces]
     figure, panels = box_rows(boxes, title)
-    for part, box, axes, mass in zip(parts, boxes, panels, masses, strict=True):
-        _draw_boxed(axes, box, part.surface, edges=False, color=STEEL)
-        words = [_size_of(part.name, box), f"volume {1e6 * part.volume:.4g} cm3"]
-        words += [f"mass {mass:.4g} kg"]
-        words += part.width_words
-        axes.set_title(", ".join(words))
+    for name, surface, words, box, axes in zip(names, surfaces, notes, boxes, panels, strict=True):
+        _draw_boxed(axes, box, surface, edges=False, color=STEEL)
+        axes.set_title(", ".join([_size_of(name, box), *words]))
     return figure
 
 
