@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -293,7 +294,10 @@ def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
     for folder in package_path:
         if not folder.is_dir():
             raise InputError(f"--package-path {folder}: expected a folder with ROS packages")
-    return read_robot(file, package_path)
+    if package_path:
+        known = os.environ.get("ROS_PACKAGE_PATH", "")
+        os.environ["ROS_PACKAGE_PATH"] = os.pathsep.join([*map(str, package_path), known])
+    return read_robot(file)
 
 
 def _write_scene(

@@ -10,6 +10,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
+from dolfinopt.mesh.checks import cell_sizes
+from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots.style import (
     BLUE,
@@ -287,7 +289,7 @@ def _caption(view: ArmView) -> str:
     long = f"{size[0]:.4g} m long"
     if view.length is not None:
         long = f"axis distance {view.length:.4g} m"
-    share = f"volume fraction {volume_fraction(view):.3f}"
+    share = f"volume fraction {np.average(view.density, weights=cell_volumes(view)):.3f}"
     return f"{view.name}:  {long}, {size[1]:.4g} m high, {share}"
 
 
@@ -306,12 +308,9 @@ def _compound(loops: Sequence[np.ndarray]) -> Path:
 # -- polygons: areas and outlines -------------------------------------------------------------
 
 
-def volume_fraction(view: ArmView) -> float:
-    """Return the mean physical density of a plane arm, weighted with its cells' areas."""
-    x, y = view.corners[..., 0], view.corners[..., 1]
-    crossed = x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y
-    area = np.abs(crossed.sum(axis=1))
-    return float(area @ view.density / area.sum())
+def cell_volumes(view: ArmView) -> np.ndarray:
+    """Return the areas (n,), m2, or volumes, m3, of an arm's cells."""
+    return cell_sizes(view.corners[:, TENSOR[view.corners.shape[1:]]])
 
 
 def sides(corners: np.ndarray) -> np.ndarray:
@@ -327,8 +326,8 @@ def boundary(corners: np.ndarray) -> np.ndarray:
     """
     flat = corners.reshape(-1, 2)
     size = float(np.ptp(flat, axis=0).max()) or 1.0
-    column, row = np.round((flat - flat.min(axis=0)) / (1e-7 * size)).astype(np.int64).T
-    node = np.unique(column * 2**24 + row, return_inverse=True)[1].reshape(corners.shape[:2])
+    places = np.round(flat / (1e-7 * size)) @ [1.0, 1j]
+    node = np.unique(places, return_inverse=True)[1].reshape(corners.shape[:2])
     edge = np.sort(sides(node), axis=1) @ [node.max() + 1, 1]
     _, first, count = np.unique(edge, return_index=True, return_counts=True)
     return first[count == 1]

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyvista
 
-from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import ArmView
 from dolfinopt.part.solid.surface import Surface, surface_at
-from dolfinopt.plots.design import bounds
+from dolfinopt.plots.design import bounds, cell_volumes
 from dolfinopt.plots.poses import box_corners
 from dolfinopt.plots.style import (
     GREY,
@@ -193,7 +192,7 @@ def surfaces_figure(
 
 def caption(view: ArmView, mass: float | None) -> str:
     """Return what stands above a link: its size, volume and mass."""
-    volumes = cell_sizes(view.corners[:, TENSOR[view.corners.shape[1:]]])
+    volumes = cell_volumes(view)
     volume = float(volumes @ view.solid)
     filled = f" ({100.0 * volume / volumes.sum():.3g} %)"
     if view.wall is not None:
