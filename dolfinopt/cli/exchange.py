@@ -453,11 +453,11 @@ def _owner(scene: Scene, name: str) -> str:
 
 
 def _surface(file: Path) -> np.ndarray:
-    """Return the triangles (n, 3, 3) of a binary STL file in millimetres, m."""
-    import numpy as np
+    """Return the triangles (n, 3, 3) of an STL file in millimetres, m."""
+    import pyvista
 
-    row = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
-    return 1e-3 * np.fromfile(file, row, offset=84)["corners"].astype(float)
+    mesh = pyvista.read(file)
+    return 1e-3 * mesh.points[mesh.regular_faces].astype(float)
 
 
 def _reduced(world: MPI.Comm, run: Path, scene: Scene, design: str | None = "design.npz") -> _Run:
