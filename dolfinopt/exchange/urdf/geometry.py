@@ -129,7 +129,7 @@ class _Grid:
             spacing=(self.step,) * 3,
             origin=[float(x) + 0.5 * self.step for x in self.low],
         )
-        surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
+        surface = pyvista.wrap(closed)
         result = surface.voxelize_binary_mask(reference_volume=image)["mask"]
         return np.asarray(result).reshape(self.shape, order="F") > 0
 
@@ -221,7 +221,7 @@ def _distance(closed: Trimesh, points: np.ndarray) -> np.ndarray:
 
     if not len(points):
         return np.zeros(0)
-    surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
+    surface = pyvista.wrap(closed)
     result = pyvista.PolyData(points).compute_implicit_distance(surface)
     return np.asarray(result["implicit_distance"])
 
@@ -370,7 +370,7 @@ def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
     import trimesh
 
     wide = 10.0 * float(np.ptp(piece.bounds, axis=0).max())
-    surface = pyvista.PolyData.from_regular_faces(piece.vertices, piece.faces)
+    surface = pyvista.wrap(piece)
     filled = surface.fill_holes(wide).triangulate()
     closed = trimesh.Trimesh(filled.points, filled.regular_faces, process=True)
     if not closed.is_watertight or len(closed.faces) < 4:
