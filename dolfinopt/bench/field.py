@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 from mpi4py import MPI
-from pydantic import ConfigDict, ValidationError, model_validator
+from pydantic import ConfigDict, ValidationError
 
 from dolfinopt.data import benchmark_folder
 from dolfinopt.dynamics.build import Trajectory
@@ -66,15 +66,13 @@ class Case(Table):
         """Of its folder."""
         return self.folder.name
 
-    @model_validator(mode="after")
-    def _check(self) -> Case:
+    def check_table(self) -> None:
         if bool(self.scene) == bool(self.program):
             raise ValueError("expected either scene or program")
         for value in self.values if self.scene else ():
             known = HISTORIES if value.table else NUMBERS
             if value.quantity not in known:
                 raise ValueError(f"quantity {value.quantity}: expected one of {', '.join(known)}")
-        return self
 
 
 def read_cases() -> tuple[Case, ...]:

@@ -13,9 +13,10 @@ import pandas as pd
 
 from dolfinopt.bench.measure import Plan
 from dolfinopt.disk import write_text
+from dolfinopt.plots.panels import Line, Panel
 from dolfinopt.plots.style import save
 from dolfinopt.study.figures import draw
-from dolfinopt.study.tables import Line, LineFigure, Panel, Table
+from dolfinopt.study.tables import LineFigure, Table
 
 Row: TypeAlias = Sequence[Any]
 Rows: TypeAlias = Iterator[Row]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -293,7 +294,10 @@ def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
     for folder in package_path:
         if not folder.is_dir():
             raise InputError(f"--package-path {folder}: expected a folder with ROS packages")
-    return read_robot(file, package_path)
+    if package_path:
+        known = os.environ.get("ROS_PACKAGE_PATH", "")
+        os.environ["ROS_PACKAGE_PATH"] = os.pathsep.join([*map(str, package_path), known])
+    return read_robot(file)
 
 
 def _write_scene(
@@ -449,11 +453,11 @@ def _owner(scene: Scene, name: str) -> str:
 
 
 def _surface(file: Path) -> np.ndarray:
-    """Return the triangles (n, 3, 3) of a binary STL file in millimetres, m."""
-    import numpy as np
+    """Return the triangles (n, 3, 3) of an STL file in millimetres, m."""
+    import pyvista
 
-    row = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("more", "<u2")])
-    return 1e-3 * np.fromfile(file, row, offset=84)["corners"].astype(float)
+    mesh = pyvista.read(file)
+    return 1e-3 * mesh.points[mesh.regular_faces].astype(float)
 
 
 def _reduced(world: MPI.Comm, run: Path, scene: Scene, design: str | None = "design.npz") -> _Run:

@@ -19,10 +19,11 @@ import click
 from dolfinopt.cli.exchange import export, import_robot
 from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.shared import PATH, Start, end_before_start, led_by_another, old_option
+from dolfinopt.cli.shared import PATH, Start, end_before_start, old_option
 from dolfinopt.cli.studies import bench, compare, reproduce, sweep, uncertainty
 from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
+from dolfinopt.interrupt import launched_rank
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ TEMPLATES = {
 @click.argument("template", type=click.Choice(list(TEMPLATES)), default="two-arm")
 @old_option("--template", "older", now="init NAME TEMPLATE", type=click.Choice(list(TEMPLATES)))
 def init(name: Path, template: str, older: str | None) -> None:
-    if led_by_another():
+    if launched_rank():  # the root does it
         return
     template = older or template
     from dolfinopt.output.folders import write_new

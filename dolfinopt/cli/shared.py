@@ -52,7 +52,7 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
     """
     from dolfinopt.scene.load import read_scene
 
-    if alone():
+    if launched_rank() is None:
         read_scene(path, overrides)
     world = start()
     # On all ranks: DOLFINx ends PETSc together with the others that have imported it.
@@ -346,16 +346,6 @@ def start() -> MPI.Comm:
     """Return all ranks for the command at work, and start MPI unless that was done."""
     given = click.get_current_context().obj
     return given.world if isinstance(given, Start) else given
-
-
-def alone() -> bool:
-    """Tell whether this process is known to be the only rank before MPI is started."""
-    return isinstance(click.get_current_context().obj, Start) and launched_rank() is None
-
-
-def led_by_another() -> bool:
-    """Tell whether another rank does the work of a command that never starts MPI."""
-    return isinstance(click.get_current_context().obj, Start) and bool(launched_rank())
 
 
 def end_before_start(error: BaseException) -> int:

@@ -27,11 +27,12 @@ from dolfinopt.disk import write_text
 from dolfinopt.loading import load_scene
 from dolfinopt.output.folders import prepare_folder
 from dolfinopt.parallel import on_root, together
+from dolfinopt.plots.panels import Line, Panel
 from dolfinopt.scene.load import Scene, tomllib
 from dolfinopt.study import studies, variants
 from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
 from dolfinopt.study.studies import QUANTITIES
-from dolfinopt.study.tables import Figure, Line, LineFigure, Panel, Table, embedded, html_page
+from dolfinopt.study.tables import Figure, LineFigure, Table, embedded, html_page
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -2,40 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import zip_longest
+from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.trajectory import drive_units, free_drives
-from dolfinopt.plots.style import (
-    BLUE,
-    FEW_POINTS,
-    INITIAL,
-    LEFT,
-    MILLI,
-    OPTIMISED,
-    ORANGE,
-    TITLE,
-    headline,
-    log_scale,
-    look,
-    looks,
-    new_figure,
-    shortened,
-    styled,
-)
+from dolfinopt.plots.panels import Limit as Bound
+from dolfinopt.plots.panels import Line, Panel, panel_figure
+from dolfinopt.plots.style import INITIAL, MILLI, OPTIMISED, look, looks
 from dolfinopt.progress import SHOWN
 from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.response import constraints_of
 from dolfinopt.scene.duration import path_length, time_law
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from dolfinopt.dynamics.build import Trajectory
@@ -43,39 +28,8 @@ if TYPE_CHECKING:
     from dolfinopt.scene.load import Scene
 
 DEVIATION = "Deviation of the end-effector from the rigid path"
-LIMIT = "0.35"  # colour of limits
-
-
-def panel_grid(used: np.ndarray, title: str, abscissa: str) -> tuple[Figure, np.ndarray]:
-    """Return a figure with panels that share x, and their axes (rows, columns).
-
-    Args:
-        used: (rows, columns) which panels there are.
-        title: above them.
-        abscissa: label of x, below the last panel of every column.
-    """
-    rows, columns = used.shape
-    width, height = 5.0 * columns if columns > 1 else 9.0, 0.9 + 2.1 * rows
-    figure = new_figure(width, height)
-    grid = figure.subplots(rows, columns, sharex=True, squeeze=False)
-    # Fixed margins, inches: there is nothing to be found out by drawing twice.
-    figure.subplots_adjust(left=LEFT / width, right=1.0 - 0.25 / width, wspace=0.2, hspace=0.32,
-                           bottom=0.5 / height, top=1.0 - 0.75 / height)  # fmt: skip
-    for axes, there in zip(grid.ravel(), used.ravel(), strict=True):
-        axes.set_visible(there)
-        axes.grid(True, alpha=0.3)
-    for column, there in zip(grid.T, used.T, strict=True):
-        for last in column[there][-1:]:
-            last.set_xlabel(abscissa)
-            last.tick_params(labelbottom=True)
-    headline(figure, title, 0.15)
-    return figure, grid
-
-
-def _head(axes: Axes, label: str, note: str) -> None:
-    """Write what a panel shows above it on the left, and its figures on the right."""
-    axes.set_title(label)
-    axes.set_title(note, loc="right")
+WIDE = 9.0  # inches, of a single column
+TIME, MILLIMETRES = "time [s]", "deviation [mm]"
 
 
 # -- history ---------------------------------------------------------------------------------
@@ -101,78 +55,44 @@ def history_of(scene: Scene, rows: Sequence[HistoryRow]) -> Figure:
     return history_figure(rows, f"{minimised.label} [{minimised.unit}]", limits)
 
 
-@styled
 def history_figure(rows: Sequence[HistoryRow], objective_label: str, limits: Limits) -> Figure:
     """Return the picture of what history.csv holds against the iteration.
+
+    Down the first column, then down the second; what is nowhere known is left out.
 
     Args:
         rows: at least one.
         objective_label: name and unit of the objective.
         limits: of the constraints.
     """
-    panels = history_panels(rows, objective_label, limits)
-    used = np.arange(2 * (-(-len(panels) // 2))).reshape(2, -1).T < len(panels)
-    figure, grid = panel_grid(used, "History of the optimisation", "iteration")
     iteration = np.array([row.iteration for row in rows])
-    # Down the first column, then down the second.
-    for axes, (label, panel) in zip(grid.T.ravel(), panels.items(), strict=False):
-        _draw_history_panel(axes, iteration, label, *panel)
-    grid[0, 0].set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
-    grid[0, 0].xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
-    return figure
 
+    def panel(
+        label: str, values: Sequence[float], factor: float = 1.0, limit: float = np.nan
+    ) -> Panel:
+        y, is_share = factor * np.array(values), label.startswith(SHARES)
+        if not is_share:  # nothing has changed yet at the first row
+            y = np.where((y > 0.0) | ~(y > 0.0).any(), y, np.nan)
+        shown = y[np.isfinite(y)]
+        ends = " → ".join(f"{value:.4g}" for value in shown[[0, -1][: len(shown)]])
+        bounds = ((factor * limit, iteration[0], iteration[-1]),) if limit == limit else ()
+        line = Line("", iteration, y)
+        return Panel(label, "iteration", "", (line,), y_log=not is_share, note=ends, limits=bounds)
 
-def history_panels(
-    rows: Sequence[HistoryRow], objective_label: str, limits: Limits
-) -> dict[str, tuple[np.ndarray, float | None]]:
-    """Return values (n,) and limit of every panel by its label; what is nowhere known is left out.
-
-    Both are in the unit that the label tells.
-    """
-    panels: dict[str, tuple[np.ndarray, float | None]] = {}
-    panels[objective_label] = np.array([row.objective for row in rows]), None
+    panels = [panel(objective_label, [row.objective for row in rows])]
     for name, (label, factor) in HISTORY.items():
         if name != "max_deviation" or "deviation" not in limits:  # a panel of the same values
-            panels[label] = factor * np.array([getattr(row, name) for row in rows]), None
+            panels.append(panel(label, [getattr(row, name) for row in rows], factor))
     for name, limit in limits.items():
         unit, factor = SHOWN.get(limit.unit, (limit.unit, 1.0))
-        values = factor * np.array([row.constraints.get(name, np.nan) for row in rows])
-        panels[f"{limit.words} [{unit}]"] = values, factor * limit.limit
-    return {label: panel for label, panel in panels.items() if np.isfinite(panel[0]).any()}
+        values = [row.constraints.get(name, np.nan) for row in rows]
+        panels.append(panel(f"{limit.words} [{unit}]", values, factor, limit.limit))
+    known = [item for item in panels if item.note]
+    half = -(-len(known) // 2)
+    pairs = zip_longest(known[:half], known[half:])
+    return panel_figure("History of the optimisation", list(pairs), height=2.1)
 
 
-def _draw_history_panel(
-    axes: Axes, iteration: np.ndarray, label: str, values: np.ndarray, limit: float | None
-) -> None:
-    """Draw one quantity, and its limit as a broken line; first and last value stand above it.
-
-    Args:
-        axes: the panel's.
-        iteration: (n,).
-        label: name and unit.
-        values: (n,) in that unit; nan where it is not known.
-        limit: in the same unit; None of what has no limit.
-    """
-    is_share, positive = label.startswith(SHARES), values > 0.0
-    if not is_share and positive.any():  # nothing has changed yet at the first row
-        values = np.where(positive, values, np.nan)
-    marker = "o" if len(values) <= FEW_POINTS else ""
-    axes.plot(iteration, values, color=BLUE, marker=marker, ms=3, clip_on=False)
-    shown = values[np.isfinite(values)]
-    _head(axes, label, " → ".join(f"{value:.4g}" for value in shown[[0, -1][: len(shown)]]))
-    if limit is not None:
-        axes.axhline(limit, color=LIMIT, ls="--", lw=1.0)
-        shown = np.append(shown, limit)
-    if is_share:
-        axes.set_ylim(0.0, 1.05 * max(1e-3, *shown))
-    elif shown.min() > 0.0:
-        log_scale(axes, shown)
-        if shown.max() <= 1.02 * shown.min():  # nothing but digits that do not matter
-            middle = float(np.sqrt(shown.min() * shown.max()))
-            axes.set_ylim(0.5 * middle, 2.0 * middle)
-
-
-@styled
 def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
     """Return the picture of how far limits are used, and what they cost.
 
@@ -184,27 +104,20 @@ def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
     limits = limits_by_column(scene, rows[0].constraints)
     if all(limit.of_mass for limit in limits.values()):
         return None
-    figure, grid = panel_grid(np.ones((2, 1), dtype=bool), "Limits of the design", "iteration")
-    above, below = grid[:, 0]
-    iteration = [row.iteration for row in rows]
+    iteration = np.array([row.iteration for row in rows])
     objective = np.array([abs(row.objective) or 1.0 for row in rows])
-    every = []
-    for number, (name, limit) in enumerate(limits.items()):
+    used, eased = [], []
+    for name, limit in limits.items():
         value = np.array([row.constraints[name] for row in rows])
-        used = 100.0 * (limit.limit / value if limit.least else value / limit.limit)
-        eased = np.array([row.multipliers.get(name, np.nan) for row in rows]) / objective
-        style: Any = look(number) | {"markevery": max(1, len(rows) // 10)}
-        above.plot(iteration, used, label=shortened(limit.words), **style)
-        below.plot(iteration, eased, **style)
-        every.append(used)
-    log_scale(above, np.append(np.concatenate(every), 100.0))
-    above.axhline(100.0, color=LIMIT, ls="--", lw=1.0)
-    above.legend(ncols=3)
-    _head(above, "share of the limit that is used [%]", "limit: 100 %")
-    _head(below, "objective gained for 1 % of the limit [%]", "")
-    below.set_ylim(bottom=0.0)
-    above.set_xlim(iteration[0], max(iteration[-1], iteration[0] + 1))
-    return figure
+        share = 100.0 * (limit.limit / value if limit.least else value / limit.limit)
+        used.append(Line(limit.words, iteration, share))
+        gained = np.array([row.multipliers.get(name, np.nan) for row in rows]) / objective
+        eased.append(Line("", iteration, gained))
+    above = Panel("share of the limit that is used [%]", "iteration", "", tuple(used), y_log=True,
+                  note="limit: 100 %", limits=((100.0, iteration[0], iteration[-1]),))  # fmt: skip
+    words = "objective gained for 1 % of the limit [%]"
+    below = Panel(words, "iteration", "", tuple(eased), y_log=False)
+    return panel_figure("Limits of the design", [[above], [below]], width=WIDE)
 
 
 # -- deviation -------------------------------------------------------------------------------
@@ -224,13 +137,12 @@ def deviation_title(trajectory: Trajectory) -> str:
     return "Deviation of the end-effector from the desired path" if controlled else DEVIATION
 
 
-@styled
 def deviation_figure(
     t: np.ndarray,
     deviation: np.ndarray,
     initial: np.ndarray | None = None,
     title: str = DEVIATION,
-    limits: Sequence[tuple[float, float, float]] = (),
+    limits: Sequence[Bound] = (),
 ) -> Figure:
     """Return the picture of the end-effector's distance from its rigid or desired path.
 
@@ -241,84 +153,50 @@ def deviation_figure(
         title: above the picture, of what from what.
         limits: m, each with the first and the last instant at which it holds, s.
     """
-    figure = new_figure(9.0, 5.0)
-    axes = figure.add_axes((0.1, 0.11, 0.88, 0.81))  # room for ticks such as 0.00025
-    curves = {"": (t, deviation)}
+    lines = [_distance("", t, lengths(deviation))]
     if initial is not None and len(initial):
         even = np.linspace(t[0], t[-1], len(initial))
-        curves = {INITIAL: (even, initial), OPTIMISED: (t, deviation)}
-    styles = looks([list(curves)]) if len(curves) > 1 else {"": look(0)}  # as the optimised design
-    for name, (times, vectors) in curves.items():
-        _draw_distance(axes, name, times, MILLI * lengths(vectors), styles[name])
-    _over_time(axes, t, "deviation [mm]", limits)
-    axes.set(ylim=(0.0, 1.1 * axes.dataLim.y1 or 1.0), xlabel="time [s]")
-    axes.set_title(title, fontsize=TITLE)
-    axes.legend()
-    return figure
+        lines = [
+            _distance(INITIAL, even, lengths(initial)),
+            _distance(OPTIMISED, t, lengths(deviation)),
+        ]
+    # The only curve looks as that of the optimised design.
+    styles = {line.label: look(len(lines) - 1 - k) for k, line in enumerate(lines)}
+    return panel_figure(title, [[_deviations(lines, limits)]], styles, 4.5, WIDE)
 
 
-def _draw_distance(
-    axes: Axes, name: str, t: np.ndarray, distance: np.ndarray, style: Mapping[str, Any]
-) -> None:
-    """Draw a distance, its largest value marked and told in the legend.
-
-    Args:
-        axes: where.
-        name: of the design or form; "" of a single one.
-        t: (n,) s.
-        distance: (n,) mm.
-        style: of the curve, see `look`.
-    """
+def _distance(name: str, t: np.ndarray, distance: np.ndarray) -> Line:
+    """Return a distance (n,), m, over time, its largest value marked and told with its name."""
     worst = int(np.argmax(distance))
-    note = f"largest {distance[worst]:.4g} mm at {t[worst]:.3f} s"
-    mark = {"marker": "o", "markevery": [worst], "clip_on": False}
-    axes.plot(t, distance, label=": ".join(filter(None, (name, note))), **{**style, **mark})
+    note = f"largest {MILLI * distance[worst]:.4g} mm at {t[worst]:.3f} s"
+    return Line(": ".join(filter(None, (name, note))), t, MILLI * distance, worst)
 
 
-@styled
+def _deviations(lines: Sequence[Line], limits: Sequence[Bound]) -> Panel:
+    """Return the panel of distances, mm, and of their limits, m."""
+    bounds = tuple((MILLI * limit, first, last) for limit, first, last in limits)
+    return Panel("", TIME, MILLIMETRES, tuple(lines), y_log=False, limits=bounds)
+
+
 def check_figure(check: Check, scene: Scene) -> Figure:
     """Return the picture of the deviation over time with every form of the arms, mm.
 
     Below, by how much that of other forms differs from that of the densities.
     """
-    figure = new_figure(9.0, 6.4)
-    upper = figure.add_axes((0.1, 0.42, 0.88, 0.51))
-    lower = figure.add_axes((0.1, 0.09, 0.88, 0.24))
-    first, styles = check.density.trajectory, looks([list(check.columns)])
+    first, known = check.density.trajectory, looks([list(check.columns)])
+    distances, differences, styles = [], [], {}
     for name, column in check.columns.items():
         own = column.trajectory
-        distance = MILLI * own.distance
-        _draw_distance(upper, name, own.t, distance, styles[name])
+        distances.append(_distance(name, own.t, own.distance))
+        styles[distances[-1].label] = known[name]
         if column is not check.density:
             base = first if np.array_equal(first.t, own.t) else first.at(own.t)
-            less, style = distance - MILLI * base.distance, styles[name] | {"marker": ""}
-            lower.plot(own.t, less, label=f"{name} less density", **style)
-    _over_time(upper, first.t, "deviation [mm]", deviation_limits(scene))
-    _over_time(lower, first.t, "difference [mm]")
-    upper.set_title(deviation_title(first), fontsize=TITLE)
-    upper.set_ylim(0.0, None)
-    lower.set_xlabel("time [s]")
-    for axes in (upper, lower):
-        axes.legend()
-    figure.align_ylabels([upper, lower])
-    return figure
-
-
-def _over_time(
-    axes: Axes, t: np.ndarray, label: str, limits: Sequence[tuple[float, float, float]] = ()
-) -> None:
-    """Label lengths over time, and draw their limits as broken lines.
-
-    Args:
-        axes: where.
-        t: (n,) s.
-        label: of y.
-        limits: m, each with the first and the last instant at which it holds, s.
-    """
-    for limit, first, last in limits:
-        axes.hlines(MILLI * limit, first, last, color=LIMIT, ls="--", lw=1.0)
-    axes.set(xlim=(t[0], t[-1]), ylabel=label)
-    axes.grid(True, alpha=0.3)
+            less = Line(f"{name} less density", own.t, MILLI * (own.distance - base.distance))
+            styles[less.label] = known[name]
+            differences.append(less)
+    upper = _deviations(distances, deviation_limits(scene))
+    lower = Panel("", TIME, "difference [mm]", tuple(differences), y_log=False)
+    return panel_figure(deviation_title(first), [[upper], [lower]], styles, width=WIDE)
 
 
 # -- drives ----------------------------------------------------------------------------------
@@ -333,85 +211,66 @@ SCALES = {
 }
 
 
-@styled
 def drives_figure(trajectory: Trajectory) -> Figure:
     """Return the picture of a machine's drives over time, and of what holds a closed loop.
 
     A row a drive, its error and its force; then the ground. Errors are q_r - q_r_desired; where no
     drive can have one, forces stand alone.
     """
-    panels = drive_panels(trajectory)
-    columns = max(map(len, panels))
-    used = np.array([[k >= columns - len(row) for k in range(columns)] for row in panels])
+    rows = list(_drive_rows(trajectory))
+    columns = max(map(len, rows))
     title = "Drives" if trajectory.loops is None else "Drives and what holds the loop"
-    figure, grid = panel_grid(used, title, "time [s]")
-    t = trajectory.t
-    quantities = [quantity for row in panels for quantity in row]
-    for axes, (label, unit, curves) in zip(grid[used], quantities, strict=True):
-        largest = max(float(np.abs(values).max()) for values in curves.values())
+    return panel_figure(title, [[*[None] * (columns - len(row)), *row] for row in rows])
+
+
+def _drive_rows(trajectory: Trajectory) -> Iterator[list[Panel]]:
+    """Yield the panels of every drive's error and force, and of the ground's force."""
+
+    def panel(label: str, unit: str, *curves: np.ndarray, names: Sequence[str] = ("",)) -> Panel:
+        largest = max(float(np.abs(values).max()) for values in curves)
         factor, shown = next((f, name) for limit, f, name in SCALES[unit] if largest < limit)
-        for (name, values), colour in zip(curves.items(), (BLUE, ORANGE), strict=False):
-            axes.plot(t, factor * values, color=colour, label=name)
-        if len(curves) > 1:
-            axes.legend(ncols=len(curves))
-        axes.axhline(0.0, color="black", lw=0.6, zorder=1.0)
-        axes.set_xlim(t[0], t[-1])
-        _head(axes, f"{label} [{shown}]", f"largest {factor * largest:.3g}")
-    return figure
+        pairs = zip(names, curves, strict=True)
+        lines = tuple(Line(name, trajectory.t, factor * values) for name, values in pairs)
+        note = f"largest {factor * largest:.3g}"
+        return Panel(f"{label} [{shown}]", TIME, "", lines, y_log=False, note=note)
 
-
-Panel = tuple[str, str, dict[str, np.ndarray]]  # label, SI unit, curves (n,) by name
-
-
-def drive_panels(trajectory: Trajectory) -> list[list[Panel]]:
-    """Return the rows of the figure: of every drive error and force, of the ground its force."""
-    scene, rows = trajectory.scene, []
+    scene, words = trajectory.scene, {"N": "force", "N m": "moment"}
     places = map(int, np.arange(scene.num_rigid)[scene.driven_columns])
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
-    units, loads = scene.rigid_units, drive_units(scene)
-    for name, k in zip(scene.driven, places, strict=True):
-        word = "force" if loads[name] == "N" else "moment"
-        row: list[Panel] = [(f"{name}: {word}", loads[name], {"": trajectory.joint_forces[:, k]})]
+    for (name, unit), k in zip(drive_units(scene).items(), places, strict=True):
+        row = [panel(f"{name}: {words[unit]}", unit, trajectory.joint_forces[:, k])]
         if name in free:
-            row.insert(0, (f"{name}: error", units[name], {"": error[:, k]}))
-        rows.append(row)
-    forces = trajectory.closure_force
-    if forces is None:
-        return rows
-    if trajectory.closure is not None:
-        names = ("",) if forces.shape[1] == 1 else ("x", "y")
-        what = "normal force on the slider" if len(names) == 1 else "force of the pin on the arm"
-        return [*rows, [(what, "N", dict(zip(names, forces.T, strict=True)))]]
-    for name, sizes in trajectory.closure_sizes.items():
-        words = {"N": "force", "N m": "moment"}
-        row = [(f"{name}: {words[unit]}", unit, {"": size}) for unit, size in sizes.items()]
-        rows += [row] if name not in scene.driven else []  # a driven rod's is its drive's
-    return rows
+            row.insert(0, panel(f"{name}: error", scene.rigid_units[name], error[:, k]))
+        yield row
+    if (forces := trajectory.closure_force) is None:
+        return
+    if trajectory.closure is not None and forces.shape[1] == 1:
+        yield [panel("normal force on the slider", "N", forces[:, 0])]
+    elif trajectory.closure is not None:
+        yield [panel("force of the pin on the arm", "N", *forces.T, names=("x", "y"))]
+    for name, sizes in trajectory.closure_sizes.items() if trajectory.closure is None else ():
+        if name not in scene.driven:  # a driven rod's is its drive's
+            yield [panel(f"{name}: {words[unit]}", unit, size) for unit, size in sizes.items()]
 
 
 # -- the law of the motion -----------------------------------------------------------------------
 
 
-@styled
 def law_figure(scene: Scene) -> Figure:
     """Return the picture of a designed law: way, speed and acceleration, with those before."""
     motion = scene.motion
-    plain = motion.unchecked_copy({"shape": 0})
-    figure, grid = panel_grid(np.ones((3, 1), dtype=bool), "Law along the path", "time [s]")
     t = np.linspace(0.0, motion.duration, LAW_INSTANTS)
     length = 1.0 if motion.path == "rotation" else path_length(motion)
     units = ("-", "1/s", "1/s2") if motion.path == "rotation" else ("m", "m/s", "m/s2")
-    laws = {"designed": time_law(motion), motion.law: time_law(plain)}
-    values = {name: law(t, motion.duration) for name, law in laws.items()}
+    plain = time_law(motion.unchecked_copy({"shape": 0}))(t, motion.duration)
+    designed = time_law(motion)(t, motion.duration)
+    rows = []
     for k, word in enumerate(("way", "speed", "acceleration")):
-        axes = grid[k, 0]
-        for (name, value), colour in zip(values.items(), (BLUE, ORANGE), strict=False):
-            axes.plot(t, length * value[k], color=colour, label=name)
-        axes.set_xlim(t[0], t[-1])
-        largest = length * np.abs(values["designed"][k]).max()
-        _head(axes, f"{word} [{units[k]}]", f"largest {largest:.3g}")
-    grid[0, 0].legend()
-    return figure
+        pairs = ("designed", length * designed[k]), (motion.law, length * plain[k])
+        lines = tuple(Line(name * (k == 0), t, values) for name, values in pairs)
+        note = f"largest {np.abs(lines[0].y).max():.3g}"
+        rows.append([Panel(f"{word} [{units[k]}]", TIME, "", lines, y_log=False, note=note)])
+    return panel_figure("Law along the path", rows, width=WIDE)
 
 
 # -- limits by the columns of the history, and over time ----------------------------------------
@@ -430,7 +289,7 @@ def limits_by_column(scene: Scene, values: Mapping[str, float]) -> dict[str, Lim
     return result
 
 
-def deviation_limits(scene: Scene) -> list[tuple[float, float, float]]:
+def deviation_limits(scene: Scene) -> list[Bound]:
     """Return the limits of the deviation, m, with first and last instant of each, s."""
     limits = []
     if (deviation := scene.constraints.limit("deviation")) is not None:

@@ -10,6 +10,8 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
+from dolfinopt.mesh.checks import cell_sizes
+from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots.style import (
     BLUE,
@@ -41,9 +43,7 @@ LOW = 0.45  # inches, least height of an arm's axes
 SCALE_FOOT = 0.75  # inches, for the scale of colours
 LABEL_FOOT = 0.6  # inches, for the label of x
 MARGIN = 0.012  # of the arms' length, around them
-PLATE = 1.0  # inches, likewise of a plate
-FACE, BRIGHT, DARK = "#b8c4cc", np.array([0.62, 0.68, 0.72]), np.array([0.20, 0.26, 0.31])
-DEPTH = np.array([0.35, 0.35])  # by which a plate's back is moved, of its thickness
+FACE = "#b8c4cc"
 CHORD = 0.02  # of drawn curves, cells
 
 
@@ -140,10 +140,15 @@ def parts_figure(
 
     plates = [part for part in parts if isinstance(part, PlanePart)]
     if not plates:
-        from dolfinopt.plots.solid import solid_parts_figure
+        from dolfinopt.plots.solid import surfaces_figure
 
         solids = [part for part in parts if isinstance(part, (SolidPart, HollowPart))]
-        return solid_parts_figure(solids, title, masses)
+        notes = [
+            [f"volume {1e6 * part.volume:.4g} cm3", f"mass {mass:.4g} kg", *part.width_words]
+            for part, mass in zip(solids, masses, strict=True)
+        ]
+        names, surfaces = zip(*((part.name, part.surface) for part in solids), strict=True)
+        return surfaces_figure(names, surfaces, notes, title)
     corners = [MILLI * part.domain.corners for part in plates]
     words = "part" if own else "part over density"
     foot = LABEL_FOOT if own else LABEL_FOOT + SCALE_FOOT
@@ -173,19 +178,16 @@ def figure_of_plates(parts: Sequence[PlanePart], densities: Sequence[float] = ()
         parts: below each other.
         densities: of their material, kg/m3: captions then tell the masses.
     """
-    boxes = [box_of(MILLI * part.domain.corners) for part in parts]
-    figure, rows = _arm_rows(boxes, "", "mm", 0.2, PLATE)
-    for k, (axes, part) in enumerate(zip(rows, parts, strict=True)):
-        loops, thickness = _loops(part), part.domain.thickness
-        _draw_plate(axes, loops, MILLI * thickness * DEPTH)
-        size = [*np.ptp(loops[0], axis=0), MILLI * thickness]
-        words = " \N{MULTIPLICATION SIGN} ".join(f"{length:.4g}" for length in size) + " mm"
-        if len(densities):
-            words += f", {densities[k] * part.shape.area * thickness:.3g} kg"
-        words += f", {len(loops) - 1} holes, {len(part.shape.curves)} curves"
-        axes.set_title(f"{part.domain.name}:  {words}")
-        axes.set_axis_off()
-    return figure
+    from dolfinopt.plots.solid import Surface, surfaces_figure
+
+    surfaces, notes = [], []
+    for k, part in enumerate(parts):
+        corners = part.facets.reshape(-1, 3)
+        surfaces.append(Surface(corners, np.arange(len(corners)).reshape(-1, 3)))
+        mass = [f"mass {densities[k] * part.volume:.3g} kg"] if len(densities) else []
+        holes, curves = len(part.shape.loops) - 1, len(part.shape.curves)
+        notes.append([*mass, f"{holes} holes", f"{curves} curves"])
+    return surfaces_figure([part.name for part in parts], surfaces, notes, "")
 
 
 def is_solid(views: Sequence[ArmView]) -> bool:
@@ -249,12 +251,12 @@ def _flat(view: ArmView, point: np.ndarray) -> np.ndarray:
 
 
 def _arm_rows(
-    boxes: Sequence[Box], title: str, unit: str, foot: float, least: float = LOW
+    boxes: Sequence[Box], title: str, unit: str, foot: float
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure with axes for each plane arm, inboard joints in one column."""
     margin = MARGIN * max(float((high - low)[0]) for low, high in boxes)
     wider = [(low - margin, high + margin) for low, high in boxes]
-    figure, rows = stacked_axes(wider, title, below=0.12, foot=foot, least=least)
+    figure, rows = stacked_axes(wider, title, below=0.12, foot=foot, least=LOW)
     for axes in rows:
         axes.set_ylabel(f"y [{unit}]")
         axes.locator_params(axis="x", nbins=max(2, int(axes.bbox.width / 90.0)))
@@ -287,7 +289,7 @@ def _caption(view: ArmView) -> str:
     long = f"{size[0]:.4g} m long"
     if view.length is not None:
         long = f"axis distance {view.length:.4g} m"
-    share = f"volume fraction {volume_fraction(view):.3f}"
+    share = f"volume fraction {np.average(view.density, weights=cell_volumes(view)):.3f}"
     return f"{view.name}:  {long}, {size[1]:.4g} m high, {share}"
 
 
@@ -306,12 +308,9 @@ def _compound(loops: Sequence[np.ndarray]) -> Path:
 # -- polygons: areas and outlines -------------------------------------------------------------
 
 
-def volume_fraction(view: ArmView) -> float:
-    """Return the mean physical density of a plane arm, weighted with its cells' areas."""
-    x, y = view.corners[..., 0], view.corners[..., 1]
-    crossed = x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y
-    area = np.abs(crossed.sum(axis=1))
-    return float(area @ view.density / area.sum())
+def cell_volumes(view: ArmView) -> np.ndarray:
+    """Return the areas (n,), m2, or volumes, m3, of an arm's cells."""
+    return cell_sizes(view.corners[:, TENSOR[view.corners.shape[1:]]])
 
 
 def sides(corners: np.ndarray) -> np.ndarray:
@@ -327,21 +326,8 @@ def boundary(corners: np.ndarray) -> np.ndarray:
     """
     flat = corners.reshape(-1, 2)
     size = float(np.ptp(flat, axis=0).max()) or 1.0
-    column, row = np.round((flat - flat.min(axis=0)) / (1e-7 * size)).astype(np.int64).T
-    node = np.unique(column * 2**24 + row, return_inverse=True)[1].reshape(corners.shape[:2])
+    places = np.round(flat / (1e-7 * size)) @ [1.0, 1j]
+    node = np.unique(places, return_inverse=True)[1].reshape(corners.shape[:2])
     edge = np.sort(sides(node), axis=1) @ [node.max() + 1, 1]
     _, first, count = np.unique(edge, return_index=True, return_counts=True)
     return first[count == 1]
-
-
-def _draw_plate(axes: Axes, loops: Sequence[np.ndarray], depth: np.ndarray) -> None:
-    """Draw a plate: its sides, those of the holes above those of the outline, then its face."""
-    for loop in loops:
-        after = np.roll(loop, -1, axis=0)
-        quads: Any = np.stack([loop, after, after + depth, loop + depth], axis=1)
-        along = after - loop
-        normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
-        light = normal @ [0.6, 0.8] / np.maximum(np.linalg.norm(normal, axis=1), 1e-300)
-        shade: Any = 0.5 * (1.0 + light[:, None]) * (BRIGHT - DARK) + DARK
-        axes.add_collection(PolyCollection(quads, fc=shade, ec=shade, lw=0.4, clip_on=False))
-    axes.add_patch(PathPatch(_compound(loops), fc=FACE, ec="#20303a", lw=0.7, clip_on=False))

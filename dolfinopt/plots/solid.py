@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyvista
 
-from dolfinopt.mesh.checks import cell_sizes
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import ArmView
 from dolfinopt.part.solid.surface import Surface, surface_at
-from dolfinopt.plots.design import bounds
+from dolfinopt.plots.design import bounds, cell_volumes
 from dolfinopt.plots.poses import box_corners
 from dolfinopt.plots.style import (
     GREY,
@@ -31,8 +30,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from dolfinopt.part.hollow import HollowPart
-    from dolfinopt.part.solid.part import SolidPart
 
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
@@ -181,30 +178,21 @@ def draw_triad(axes: Axes, camera: Camera, at: np.ndarray, length: float) -> Non
         axes.text(x, y, name, ha="center", va="center", fontsize=9)
 
 
-def solid_parts_figure(
-    parts: Sequence[SolidPart | HollowPart], title: str, masses: Sequence[float]
+def surfaces_figure(
+    names: Sequence[str], surfaces: Sequence[Surface], notes: Sequence[Sequence[str]], title: str
 ) -> Figure:
-    """Return the picture of parts below each other, to one scale.
-
-    Args:
-        parts: of solid arms.
-        title: above the picture.
-        masses: of the parts, kg.
-    """
-    boxes = [(item.surface.points.min(axis=0), item.surface.points.max(axis=0)) for item in parts]
+    """Return the picture of parts below each other, to one scale, each under its size and notes."""
+    boxes = [(item.points.min(axis=0), item.points.max(axis=0)) for item in surfaces]
     figure, panels = box_rows(boxes, title)
-    for part, box, axes, mass in zip(parts, boxes, panels, masses, strict=True):
-        _draw_boxed(axes, box, part.surface, edges=False, color=STEEL)
-        words = [_size_of(part.name, box), f"volume {1e6 * part.volume:.4g} cm3"]
-        words += [f"mass {mass:.4g} kg"]
-        words += part.width_words
-        axes.set_title(", ".join(words))
+    for name, surface, words, box, axes in zip(names, surfaces, notes, boxes, panels, strict=True):
+        _draw_boxed(axes, box, surface, edges=False, color=STEEL)
+        axes.set_title(", ".join([_size_of(name, box), *words]))
     return figure
 
 
 def caption(view: ArmView, mass: float | None) -> str:
     """Return what stands above a link: its size, volume and mass."""
-    volumes = cell_sizes(view.corners[:, TENSOR[view.corners.shape[1:]]])
+    volumes = cell_volumes(view)
     volume = float(volumes @ view.solid)
     filled = f" ({100.0 * volume / volumes.sum():.3g} %)"
     if view.wall is not None:

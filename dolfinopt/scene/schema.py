@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
-from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, field_validator
 
 from dolfinopt import version
 from dolfinopt.data import mesh_folder
@@ -374,8 +374,8 @@ class Scene(Table):
             result[arm.name] = arm.like(result.get(arm.design))
         return tuple(result.values()) if len(result) == len(arms) else arms
 
-    @model_validator(mode="after")
-    def _check_tables(self) -> Scene:
+    def check_table(self) -> None:
+        """Let every table check what it and others must agree on."""
         # Closures first: which joints are driven depends on them; then forces, since an interface
         # with a wrong name elsewhere seems to be of no use.
         first = ("closures", "forces")
@@ -385,7 +385,6 @@ class Scene(Table):
             for i, table in enumerate(tables):
                 if isinstance(table, Table):
                     table.check_at(self, (key, i) if tables is value else (key,))
-        return self
 
 
 # Keys that name a file, as (table, key); a scene holds their absolute paths.

@@ -16,9 +16,10 @@ from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import lengths
 from dolfinopt.output.design import designed
 from dolfinopt.output.trajectory import drive_units
+from dolfinopt.plots.panels import Line, Panel, panel_figure
 from dolfinopt.plots.style import look
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.tables import Line, LineFigure, Panel, Table, embedded, html_page
+from dolfinopt.study.tables import Table, embedded, html_page
 from dolfinopt.study.variants import differences
 
 if TYPE_CHECKING:
@@ -197,11 +198,9 @@ def _plot(
     sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]
 ) -> tuple[str, Image]:
     """Return curves of both runs over time, and their title."""
-    from dolfinopt.study.figures import line_figure
-
     lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
     panel = Panel(title, "time [s]", label, lines, y_log=False)
-    return title, _embedded(line_figure(LineFigure("", title, (panel,)), LOOKS))
+    return title, _embedded(panel_figure("", [[panel]], LOOKS))
 
 
 def _embedded(figure: Figure) -> Image:

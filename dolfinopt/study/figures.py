@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.output.design import designed, read_views
 from dolfinopt.plots import style
+from dolfinopt.plots.panels import Looks, panel_figure
 from dolfinopt.plots.style import GREY
 from dolfinopt.study import tables
-from dolfinopt.study.tables import FrameFigure, LineFigure, Panel
+from dolfinopt.study.tables import FrameFigure, LineFigure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
 
 CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
-LEGEND: dict[str, Any] = {"loc": "upper left", "handlelength": 5.0}
-
-Looks = Mapping[str, Mapping[str, Any]]
 
 
 def draw_study(study: tables.Study, folder: Path) -> list[Path]:
@@ -83,49 +81,10 @@ def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") ->
 # -- curves ----------------------------------------------------------------------------------
 
 
-@style.styled
 def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
-    """Return the panels below each other, flush, each with its legend: legible on a phone."""
-    panels = figure.panels
-    styles = styles or common_looks([figure])
-    heights = [2.9 + 0.21 * len(panel.lines) for panel in panels]
-    drawn = style.new_figure(5.4, sum(heights), laid_out=True)
-    drawn.set_dpi(160)  # px per inch
-    grid = drawn.subplots(len(panels), 1, squeeze=False, height_ratios=[1.0] * len(panels))[:, 0]
-    for axes, panel in zip(grid, panels, strict=True):
-        _draw_panel(axes, panel, styles)
-        if panel.lines and [line.label for line in panel.lines] != [panel.title]:
-            names = [style.shortened(line.label) for line in panel.lines]
-            axes.legend(axes.lines, names, **LEGEND, bbox_to_anchor=(0.0, -0.2), borderaxespad=0.0)
-    drawn.align_ylabels(list(grid))
-    return drawn
-
-
-def _draw_panel(axes: Axes, panel: Panel, styles: Looks) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    for line in panel.lines:
-        look = dict(styles[line.label])
-        if len(line.x) > style.FEW_POINTS:
-            look["marker"] = ""
-        axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **look)
-    y = np.concatenate([[], *(line.y[np.isfinite(line.y)] for line in panel.lines)])
-    x = np.concatenate([[], *(line.x for line in panel.lines)])
-    wide = bool(len(y)) and panel.y_log is not False and style.spans_decade(y)
-    if panel.log:
-        axes.set(xscale="log", yscale="log")
-    elif wide or (panel.y_log and len(y) and y.min() > 0.0):
-        style.log_scale(axes, y)
-    elif len(y) and 0.0 <= y.min() < 0.5 * y.max():
-        axes.set_ylim(bottom=0.0)
-    if panel.x_log2 and len(x) and x.min() > 0.0:
-        style.log2_scale(axes)
-    elif len(x) and (x % 1 == 0).all() and not panel.log:
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if any(len(line.x) > style.FEW_POINTS for line in panel.lines):
-        axes.set_xlim(x.min(), x.max())
-    _label(axes, panel.title, panel.x_label, panel.y_label)
-    axes.grid(True, alpha=0.3)
+    """Return the panels below each other."""
+    rows = [[panel] for panel in figure.panels]
+    return panel_figure("", rows, styles or common_looks([figure]))
 
 
 # -- tables and samples ------------------------------------------------------------------------

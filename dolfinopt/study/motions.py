@@ -18,7 +18,7 @@ import pandas as pd
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, chain_of
-from dolfinopt.disk import make_folder, write_text
+from dolfinopt.disk import make_folder, write_table
 from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
 from dolfinopt.output.design import arms_with_design
@@ -155,10 +155,9 @@ def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
     joints = np.arange(scene.num_rigid)[scene.driven_columns]
     end = scene.motion.duration + shaper.longer
     t = np.linspace(0.0, end, ROWS)
-    rows = np.column_stack([t, shaper.shaped(lambda t: motion(t).q[:, joints], t)])
-    lines = [",".join(f"{x:.15g}" for x in row) for row in rows.tolist()]
+    shaped = shaper.shaped(lambda t: motion(t).q[:, joints], t)
     make_folder(file.parent)
-    write_text(file, "\n".join([",".join(["t", *scene.driven]), *lines, ""]))
+    write_table(file, ["t", *scene.driven], [t, shaped], 15)
     data = scene.to_tree()
     keys = (*KEPT, "elbow") if scene.closures else KEPT  # which way a loop is closed
     kept = {key: data["motion"][key] for key in keys if key in data["motion"]}

@@ -22,6 +22,7 @@ from mpi4py import MPI
 from dolfinopt.errors import InputError
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.parallel import on_root, together
+from dolfinopt.plots.panels import Line, Panel
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.cases import Case, Outcome, Runner
@@ -29,9 +30,7 @@ from dolfinopt.study.tables import (
     DesignFigure,
     Figure,
     FrameFigure,
-    Line,
     LineFigure,
-    Panel,
     Study,
     Table,
     file_name,

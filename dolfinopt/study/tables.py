@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import pandas as pd
 
 from dolfinopt.data import page_folders
 from dolfinopt.disk import write_text
+from dolfinopt.plots.panels import Panel
 from dolfinopt.scene.load import Scene
 
 Cell = str | int | float
@@ -55,28 +55,6 @@ def as_text(frame: pd.DataFrame, digits: int, missing: str = "") -> pd.DataFrame
 
 
 # -- figures ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """One curve: its label in the legend; x and y of equal lengths."""
-
-    label: str
-    x: np.ndarray
-    y: np.ndarray
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Curves over one pair of axes, which are labelled with their units."""
-
-    title: str
-    x_label: str
-    y_label: str
-    lines: tuple[Line, ...]
-    x_log2: bool = False  # numbers that are doubled rather than added to, as those of coordinates
-    y_log: bool | None = None  # although the values span no decade; False: never logarithmic
-    log: bool = False  # both axes
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,10 @@ import pandas as pd
 import pytest
 from pictures import TOLERANCE, difference
 
+from dolfinopt.plots.panels import Line, Panel
 from dolfinopt.plots.style import looks
 from dolfinopt.study.figures import line_figure
-from dolfinopt.study.tables import Line, LineFigure, Panel, Table
+from dolfinopt.study.tables import LineFigure, Table
 
 PICTURE = Path(__file__).parent / "sweep.png"  # written by `bare`, then looked at
 pytestmark = pytest.mark.serial  # one rank shows all there is

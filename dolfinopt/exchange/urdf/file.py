@@ -34,12 +34,11 @@ SECTIONS = 64  # flat sides of a cylinder
 SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}  # of shapes
 
 
-def read_robot(file: Path, package_path: Sequence[Path] = ()) -> Robot:
+def read_robot(file: Path) -> Robot:
     """Read a robot and the surfaces of its links.
 
     Args:
-        file: URDF.
-        package_path: folders with ROS packages, looked through before others, see `mesh_path`.
+        file: URDF; packages are looked for as `mesh_path` says.
 
     Raises:
         InputError: yourdfpy is not installed; no such file; not URDF; joints that a scene does not
@@ -64,7 +63,7 @@ def read_robot(file: Path, package_path: Sequence[Path] = ()) -> Robot:
         _check_names(file, "joint", [joint.name for joint in model.joints])
         joints = [_joint(file, item) for item in model.joints]
         _check_mimics(file, joints)
-        links = {item.name: _link(file, item, package_path) for item in model.links}
+        links = {item.name: _link(file, item) for item in model.links}
     root, ordered = _ordered(file, list(links), joints)
     return Robot(model.name, file, links, ordered, root)
 
@@ -246,25 +245,25 @@ def _pose(origin: Any) -> np.ndarray:
     return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
 
 
-def _link(file: Path, link: Any, package_path: Sequence[Path]) -> RobotLink:
-    shapes, missing = _shapes(file, link.name, link.collisions or link.visuals, package_path)
+def _link(file: Path, link: Any) -> RobotLink:
+    shapes, missing = _shapes(file, link.name, link.collisions or link.visuals)
 
     def visual() -> tuple[Trimesh, ...]:
         with _quiet():
-            return _shapes(file, link.name, link.visuals, package_path)[0]
+            return _shapes(file, link.name, link.visuals)[0]
 
     both = link.collisions and link.visuals
     return RobotLink(link.name, _inertia(file, link), shapes, missing, visual if both else None)
 
 
 def _shapes(
-    file: Path, link: str, elements: Sequence[Any], package_path: Sequence[Path]
+    file: Path, link: str, elements: Sequence[Any]
 ) -> tuple[tuple[Trimesh, ...], tuple[str, ...]]:
     """Return the surfaces of a link's elements in its frame, and meshes that cannot be read."""
     shapes, missing = [], []
     for element in elements:
         try:
-            shape = _shape(file, link, element.geometry, package_path)
+            shape = _shape(file, link, element.geometry)
         except FileNotFoundError as error:
             missing.append(str(error))
             continue
@@ -295,7 +294,7 @@ def _check_finite(where: str, numbers: Any, positive: bool = False) -> None:
         raise InputError(f"{where}: expected {kind} numbers, found {given}")
 
 
-def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -> Trimesh:
+def _shape(file: Path, link: str, geometry: Any) -> Trimesh:
     """Return the surface of a geometry element of a link."""
     from trimesh import creation
 
@@ -309,15 +308,15 @@ def _shape(file: Path, link: str, geometry: Any, package_path: Sequence[Path]) -
         return creation.icosphere(subdivisions=4, radius=shape.radius)
     if (shape := geometry.cylinder) is not None:
         return creation.cylinder(radius=shape.radius, height=shape.length, sections=SECTIONS)
-    return _mesh(file, geometry.mesh, package_path)
+    return _mesh(file, geometry.mesh)
 
 
-def _mesh(file: Path, mesh: Any, package_path: Sequence[Path]) -> Trimesh:
+def _mesh(file: Path, mesh: Any) -> Trimesh:
     import trimesh
 
     if not mesh.filename:
         raise FileNotFoundError("a mesh without a name")
-    path = mesh_path(file, mesh.filename, package_path)
+    path = mesh_path(file, mesh.filename)
     if path is None:
         raise FileNotFoundError(f"mesh {mesh.filename} not found{_similar(file, mesh.filename)}")
     try:
@@ -349,11 +348,11 @@ def sources_of(file: Path) -> list[Path]:
     return [file, *(path for path in result if path is not None)]
 
 
-def mesh_path(file: Path, name: str, package_path: Sequence[Path] = ()) -> Path | None:
+def mesh_path(file: Path, name: str) -> Path | None:
     """Return where a mesh that a URDF file names lies; None where it is not found.
 
-    "package://ROBOT/meshes/a.stl" is looked for in a folder ROBOT within those of `package_path`
-    and of ROS_PACKAGE_PATH, in share/ROBOT within those of AMENT_PREFIX_PATH, and in the folders
+    "package://ROBOT/meshes/a.stl" is looked for in a folder ROBOT within those of
+    ROS_PACKAGE_PATH, in share/ROBOT within those of AMENT_PREFIX_PATH, and in the folders
     above the file, as it is named and where symbolic links lead. Such a folder may be ROBOT itself.
     Last, ROBOT left out, beside the file and in the folders above it.
     """
@@ -363,18 +362,18 @@ def mesh_path(file: Path, name: str, package_path: Sequence[Path] = ()) -> Path 
         places = [path] if path.is_absolute() else [above / path for above in _folders_above(file)]
     else:
         package, _, inner = rest.lstrip("/").partition("/")
-        places = [root / inner for root in _packages(file, package, package_path)]
+        places = [root / inner for root in _packages(file, package)]
         places += [folder / inner for folder in _folders_above(file)]
     return next((place for place in places if place.is_file()), None)
 
 
-def _packages(file: Path, package: str, package_path: Sequence[Path]) -> Iterator[Path]:
+def _packages(file: Path, package: str) -> Iterator[Path]:
     """Yield the folders that may be a ROS package."""
 
     def stated(variable: str) -> list[Path]:
         return [Path(place) for place in os.environ.get(variable, "").split(os.pathsep) if place]
 
-    for folder in (*package_path, *stated("ROS_PACKAGE_PATH")):
+    for folder in stated("ROS_PACKAGE_PATH"):
         if folder.absolute().name == package:
             yield folder
         yield folder / package

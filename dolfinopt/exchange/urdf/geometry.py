@@ -21,6 +21,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from dolfinopt.exchange.urdf.robot import CELLS, FEWEST, SceneBody, inverse
+from dolfinopt.mesh.solid_cells import boundary
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -46,13 +47,9 @@ PATCH = 0.04  # share of the outer facets that are an interface where the link i
 LONGEST = 0.9  # of the side of a cell: move of a corner
 EASED = 0.85  # share of a move that is left where it spoils a cell, again and again
 LEAST = 0.15  # of a cube's: Jacobian at a corner of a cell whose corners were moved
-# Corners of a cube in the order of Gmsh's hexahedron, and its six sides, seen from outside.
+# Corners of a cube in the order of Gmsh's hexahedron.
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0],
                     [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # fmt: skip
-SIDES = {
-    (0, -1): (0, 4, 7, 3), (0, 1): (1, 2, 6, 5), (1, -1): (0, 1, 5, 4),
-    (1, 1): (3, 7, 6, 2), (2, -1): (0, 3, 2, 1), (2, 1): (4, 5, 6, 7),
-}  # fmt: skip
 # Neighbours of every corner of a cube, right-handed.
 AROUND = ((1, 3, 4), (2, 0, 5), (3, 1, 6), (0, 2, 7), (7, 5, 0), (4, 6, 1), (5, 7, 2), (6, 4, 3))
 
@@ -132,7 +129,7 @@ class _Grid:
             spacing=(self.step,) * 3,
             origin=[float(x) + 0.5 * self.step for x in self.low],
         )
-        surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
+        surface = pyvista.wrap(closed)
         result = surface.voxelize_binary_mask(reference_volume=image)["mask"]
         return np.asarray(result).reshape(self.shape, order="F") > 0
 
@@ -224,7 +221,7 @@ def _distance(closed: Trimesh, points: np.ndarray) -> np.ndarray:
 
     if not len(points):
         return np.zeros(0)
-    surface = pyvista.PolyData.from_regular_faces(closed.vertices, closed.faces)
+    surface = pyvista.wrap(closed)
     result = pyvista.PolyData(points).compute_implicit_distance(surface)
     return np.asarray(result["implicit_distance"])
 
@@ -373,7 +370,7 @@ def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
     import trimesh
 
     wide = 10.0 * float(np.ptp(piece.bounds, axis=0).max())
-    surface = pyvista.PolyData.from_regular_faces(piece.vertices, piece.faces)
+    surface = pyvista.wrap(piece)
     filled = surface.fill_holes(wide).triangulate()
     closed = trimesh.Trimesh(filled.points, filled.regular_faces, process=True)
     if not closed.is_watertight or len(closed.faces) < 4:
@@ -527,30 +524,15 @@ def _cells(
     nodes, cells = np.unique(corners, axis=0, return_inverse=True)
     cells = cells.reshape(-1, 8)
     points = start + side * nodes
-    facets, axes = _facets(solid, cells)
+    facets = boundary(cells)
     if ends is not None:
-        flat = axes == 0
         x = points[facets].mean(axis=1)[:, 0]
-        patches = [facets[flat & (np.abs(x - end) < 1e-6 * side)] for end in ends]
+        patches = [facets[np.abs(x - end) < 1e-6 * side] for end in ends]
     else:
         patches = _nearest(points, facets, length)
     held = [np.unique(patch) for patch in patches]
     points = _on_surface(pieces, points, cells, facets, region, fine, held, ends is not None)
     return LinkCells(points, cells, patches[0], patches[1], side, tuple(notes))
-
-
-def _facets(solid: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the outer facets (k, 4) of the cells of a grid, and the axis across each (k,)."""
-    where = np.argwhere(solid)
-    around = np.pad(solid, 1)
-    result, axes = [], []
-    for (axis, way), side in SIDES.items():
-        neighbour = where + 1
-        neighbour[:, axis] += way
-        outer = ~around[tuple(neighbour.T)]
-        result.append(cells[outer][:, side])
-        axes.append(np.full(outer.sum(), axis))
-    return np.concatenate(result), np.concatenate(axes)
 
 
 def _nearest(points: np.ndarray, facets: np.ndarray, length: float) -> list[np.ndarray]:

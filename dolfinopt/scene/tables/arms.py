@@ -301,8 +301,16 @@ class Arm(Table):
 
     _scaled: bool = PrivateAttr(False)
 
-    @model_validator(mode="after")
-    def _check_kind(self) -> Arm:
+    def check_table(self) -> None:
+        """Refuse what does not make an arm of one kind."""
+        self._check_kind()
+        self._check_thickness()
+        self._check_hollow()
+        check_dampers(self)
+        self._check_ends()
+        self._check_mesh()
+
+    def _check_kind(self) -> None:
         stated = [key for key in ("design", "sid") if getattr(self, key) is not None]
         if self.rigid:
             stated.append("rigid")
@@ -317,10 +325,8 @@ class Arm(Table):
                 "regions",
                 stated[0],
             )
-        return self
 
-    @model_validator(mode="after")
-    def _check_thickness(self) -> Arm:
+    def _check_thickness(self) -> None:
         for key in ("symmetric", "extruded"):
             if getattr(self, key) and not self.is_solid and (key, self.symmetric) != (key, True):
                 raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", key)
@@ -337,12 +343,10 @@ class Arm(Table):
                     key,
                     "extruded",
                 )
-        return self
 
-    @model_validator(mode="after")
-    def _check_hollow(self) -> Arm:
+    def _check_hollow(self) -> None:
         if not self.hollow or not self.flexible:
-            return self
+            return
         if self.cells is None or len(self.cells) != 3:
             raise Refusal(
                 "expected false without cells = [nx, ny, nz]: the hull of a hollow arm is a box "
@@ -378,7 +382,6 @@ class Arm(Table):
                 "cells",
             )
         self._check_wall()
-        return self
 
     def _check_wall(self) -> None:
         """Refuse limits of the wall that leave no room or no hollow."""
@@ -438,11 +441,6 @@ class Arm(Table):
         assert self.cells is not None
         return 2 * sum(self.cells[1:])
 
-    @model_validator(mode="after")
-    def _check_joint(self) -> Arm:
-        check_dampers(self)
-        return self
-
     @property
     def own(self) -> bool:
         """Whether the arm has a mesh and a body of its own."""
@@ -482,17 +480,15 @@ class Arm(Table):
         """Whether the arm is meshed and reduced here, alone or with the arm it shares with."""
         return not self.rigid and self.sid is None
 
-    @model_validator(mode="after")
-    def _check_ends(self) -> Arm:
+    def _check_ends(self) -> None:
         if self.length < SHORTEST and not (self.rigid and self.length == 0.0):
             raise Refusal(f"expected a number >= {SHORTEST:g} and <= 10000 [m]", "length")
         if self.rigid and self.length == 0.0:
-            return self
+            return
         if 2.0 * self.solid_ends >= self.length:
             raise Refusal(
                 f"expected less than half of length = {self.length} [m]", "passive", "length"
             )
-        return self
 
     @model_validator(mode="before")
     @classmethod
@@ -504,13 +500,12 @@ class Arm(Table):
             return {"cells": None} | data
         return {key: value for key, value in data.items() if (key, value) != ("cells", None)}
 
-    @model_validator(mode="after")
-    def _check_mesh(self) -> Arm:
+    def _check_mesh(self) -> None:
         check_bores(self)
         if self.mesh is None:
             if self.hull is None:
                 self.refuse_stated("interface_offset", "without mesh: an arm of cells has no file")
-            return self
+            return
         if self.mesh_scale != 1.0 and Path(self.mesh).suffix.lower() in STEP_FILES:
             raise Refusal("expected none: a STEP file states its unit", "mesh_scale", "mesh")
         if self.interface_offset is not None and not self.is_solid:
@@ -547,7 +542,6 @@ class Arm(Table):
         if self.element == "incompatible" and self.cell_shape in SIMPLICES:
             cells = "triangles" if self.cell_shape == "triangle" else "tetrahedra"
             raise Refusal(f'expected "linear" or "quadratic" with {cells}', "element", "cell_shape")
-        return self
 
     @property
     def is_solid(self) -> bool:

@@ -237,7 +237,15 @@ class Table(BaseModel):
                 reason = f"without {use.choice}"
             for key in use.keys.split():
                 self.refuse_stated(key, reason, use.choice)
+        self.check_table()
         return self
+
+    def check_table(self) -> None:
+        """Check what the values of this table must agree on.
+
+        Raises:
+            Refusal: they do not.
+        """
 
     def refuse_stated(self, key: str, reason: str, *others: str) -> None:
         """Raise if a key, of any path, has not its default; `reason` goes on after it."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, field_validator, model_validator
+from pydantic import AfterValidator, field_validator
 
 from dolfinopt.scene.tables.base import (
     Angle,
@@ -127,8 +127,7 @@ class Closures(Table):
     def _check_axis(cls, axis: Components | None) -> Components | None:
         return axis if axis is None else check_direction(axis)
 
-    @model_validator(mode="after")
-    def _check_kind(self) -> Closures:
+    def check_table(self) -> None:
         needed = {"slider": ("axis",), "universal": ("axis", "cross_axis")}
         for key in needed.get(self.kind, ()):
             if getattr(self, key) is None:
@@ -136,7 +135,6 @@ class Closures(Table):
                 raise Refusal(reason, key, "kind")
         if self.kind == "universal":
             self._check_cross()
-        return self
 
     def _check_cross(self) -> None:
         assert self.axis is not None and self.cross_axis is not None

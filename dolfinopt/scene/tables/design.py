@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dolfinopt.scene.tables.base import (
     MAX_ITERATIONS,
@@ -159,10 +159,9 @@ class Design(Table):
                     f"wider {what} or finer cells",
                 )
 
-    @model_validator(mode="after")
-    def _check_widths(self) -> Design:
+    def _check_widths(self) -> None:
         if not (stated := self.stated_widths):
-            return self
+            return
         key = next(iter(stated))
         # The width that `WIDEST` gives, in widths of `erosion`.
         ratio = math.acosh(1.0 / (1.0 - 2.0 * WIDEST)) / math.acosh(
@@ -187,10 +186,10 @@ class Design(Table):
                 "filter_radius",
                 key,
             )
-        return self
 
-    @model_validator(mode="after")
-    def _check_minimum(self) -> Design:
+    def check_table(self) -> None:
+        """Refuse widths that one filter cannot give, and a least density above others."""
+        self._check_widths()
         if self.minimum >= self.initial:
             raise Refusal(f"expected less than initial = {self.initial} [-]", "minimum", "initial")
         if self.volume_fraction is not None and self.minimum > self.volume_fraction:
@@ -199,7 +198,6 @@ class Design(Table):
                 "minimum",
                 "volume_fraction",
             )
-        return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what the arms, their cells and their solid ends cannot meet."""
@@ -316,8 +314,7 @@ class Region(Table):
         "middle; default: through the whole thickness [m]",
     )
 
-    @model_validator(mode="after")
-    def _check_shape(self) -> Region:
+    def check_table(self) -> None:
         if (self.box is None) == (self.circle is None):
             raise Refusal(
                 "expected one of box = [x0, y0, x1, y1] and circle = [x, y, radius] "
@@ -329,7 +326,6 @@ class Region(Table):
             raise Refusal("expected [x0, y0, x1, y1] with x0 < x1 and y0 < y1 [m]", "box")
         if self.depth is not None and not self.depth[0] < self.depth[1]:
             raise Refusal("expected [z0, z1] with z0 < z1 [m]", "depth")
-        return self
 
     @property
     def shape(self) -> Literal["box", "circle"]:

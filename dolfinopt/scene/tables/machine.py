@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field
 
 from dolfinopt.scene.tables.arms import Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import (
@@ -132,24 +132,14 @@ class Joint(Table):
         """Whether it has a coordinate."""
         return self.type != "fixed"
 
-    @model_validator(mode="after")
-    def _check_limits(self) -> Joint:
+    def check_table(self) -> None:
         if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
             raise Refusal("expected the least first, then the largest", "position_limits")
-        return self
-
-    @model_validator(mode="after")
-    def _check_parts(self) -> Joint:
         check_dampers(self)
-        return self
-
-    @model_validator(mode="after")
-    def _check_axis(self) -> Joint:
         if self.axis is None and self.moves:
             raise Refusal(
                 f"expected an array of three numbers with a {self.type} joint", "axis", "type"
             )
-        return self
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse names that are unknown; with the last joint, all that joints rule out.
@@ -377,11 +367,9 @@ class Force(Table):
         True, "the feed-forward of [control] knows it; false: a disturbance [-]"
     )
 
-    @model_validator(mode="after")
-    def _check_given(self) -> Force:
+    def check_table(self) -> None:
         if self.force is None and self.moment is None and self.table is None:
             raise Refusal("expected force, moment, or table = a file: nothing acts", "force")
-        return self
 
     def force_in(self, dimension: int) -> tuple[float, ...]:
         """Return the constant force (d,), N."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
+from pydantic import AfterValidator, Field, WithJsonSchema
 
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.tables.base import (
@@ -148,10 +148,8 @@ class Material(Table):
         ratio = self.poisson_ratio
         return ratio[0] if isinstance(ratio, tuple) else ratio
 
-    @model_validator(mode="after")
-    def _check_law(self) -> Material:
+    def check_table(self) -> None:
         self.check_law()
-        return self
 
     def check_law(self, dim: int | None = None) -> None:
         """Refuse keys that the kind does not have, or lacks, and values that no material has.

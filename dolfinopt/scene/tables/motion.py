@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import (
@@ -177,8 +177,7 @@ class Motion(Table):
         "gravitational acceleration in x and y; in space, with [[joints]], in x, y and z [m/s2]",
     )
 
-    @model_validator(mode="after")
-    def _check_path(self) -> Motion:
+    def check_table(self) -> None:
         tabulated = self.path in ("points", "joints")
         if tabulated and self.file is None:
             raise Refusal(
@@ -191,7 +190,7 @@ class Motion(Table):
         if self.path == "rotation" and not self.is_fixed:
             raise Refusal('expected "fixed" with motion.path = "rotation"', "base", "path")
         self._check_law()
-        return self
+        self._check_dwells()
 
     def _check_law(self) -> None:
         """Raise where the law does not use a limit, or the path ends behind the horizon."""
@@ -232,8 +231,7 @@ class Motion(Table):
         """The dwells that the scene states, s."""
         return () if isinstance(self.dwells, bool) else self.dwells
 
-    @model_validator(mode="after")
-    def _check_dwells(self) -> Motion:
+    def _check_dwells(self) -> None:
         last = 0.0
         for start, end in self.stated_dwells:
             if not last <= start < end:
@@ -250,7 +248,6 @@ class Motion(Table):
                 "dwells",
                 "horizon",
             )
-        return self
 
     def _check_limits(self) -> None:
         """Refuse a duration in which the limits cannot be kept."""
@@ -436,21 +433,20 @@ class Reduction(Table):
         """Frequency band whose responses "balanced" weights, Hz."""
         return (self.frequencies[0], self.frequencies[-1]) if self.frequencies else BAND
 
-    @model_validator(mode="after")
-    def _check_frequencies(self) -> Reduction:
+    def _check_frequencies(self) -> None:
         given = self.frequencies
         if given is None:
-            return self
+            return
         if self.method == "krylov" and (not given or len(set(given)) < len(given)):
             raise Refusal("expected at least one number >= 0, none of them twice", "frequencies")
         if self.method == "balanced" and (len(given) != 2 or given[0] >= given[1]):
             raise Refusal("expected two frequencies, the lower one first", "frequencies")
-        return self
 
-    @model_validator(mode="after")
-    def _check_coordinates(self) -> Reduction:
+    def check_table(self) -> None:
+        """Refuse frequencies and numbers of coordinates that the method cannot have."""
+        self._check_frequencies()
         if self.coordinates == "auto" or self.count >= self.fewest:
-            return self
+            return
         if self.method == "craig-bampton":
             raise Refusal(
                 'expected an integer >= 3 with reduction.method = "craig-bampton" '
