@@ -26,7 +26,6 @@ from dolfinopt.output.trajectory import drive_units
 from dolfinopt.part.buckling import LeastBuckling, lowest_buckling
 from dolfinopt.part.domain import ANOTHER
 from dolfinopt.part.folder import scene_data, toml_text
-from dolfinopt.part.part import Meshes, Part, PartMesh
 from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.dynamics.collocation import Solution
     from dolfinopt.parallel import Partition
+    from dolfinopt.part.part import Meshes, Part, PartMesh
     from dolfinopt.responses.evaluation import Evaluation
 
 

@@ -106,7 +106,7 @@ class FreeSides:
         return None if result is None else (replace(self, sides=result[0]), result[1])
 
     def meshed(self, finer: Sequence[np.ndarray]) -> Mesh:
-        """Return a new mesh of it, see `part.Part.mesh`."""
+        """Return a new mesh of it, see `PlanePart.mesh`."""
         return self.current.mesh(finer=finer)
 
     def followed(self, mesh: Mesh) -> Mesh | None:

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.part.domain import Domain
 from dolfinopt.part.plane.fit import fitted_sides
-from dolfinopt.part.plane.limits import limits_of_part
+from dolfinopt.part.plane.limits import Limits, interfaces, limits_of_part
 from dolfinopt.part.plane.outline import AREA, polygons_of
 from dolfinopt.part.plane.part import PlanePart
 
@@ -55,7 +56,7 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     domain, drawn = part.domain, part.outline
     limits = limits_of_part(domain, drawn.tool_radius)
     stays = limits.stays
-    arm, span = _between_bores(limits.arm, stays)
+    arm, span = _between_bores(domain, limits)
     fillet = max(domain.cell, drawn.tool_radius)
 
     def rounded(hole: Geometry) -> Geometry:
@@ -88,17 +89,20 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     return replace(part, outline=result, sides=sides)
 
 
-def _between_bores(arm: Geometry, stays: Geometry) -> tuple[Geometry, tuple[float, float]]:
+def _between_bores(domain: Domain, limits: Limits) -> tuple[Geometry, tuple[float, float]]:
     """Return an arm without what lies beyond bores at its ends, and from where to where bays go."""
-    # Flanges run straight from a bore's ring to the arm's own edges where the bays begin.
+    # Flanges run straight from the arm's own edges where the bays begin towards bores. Tangents of
+    # the rings around those would leave no corner that could move.
     import shapely
 
+    arm, stays = limits.arm, limits.stays
     left, low, right, high = arm.bounds
     middle, rings = 0.5 * (left + right), [item.bounds for item in polygons_of(stays)]
     first = max((box[2] for box in rings if box[2] < middle), default=left)
     last = min((box[0] for box in rings if box[0] > middle), default=right)
     between = arm.intersection(shapely.box(first, low, last, high))
-    return arm.intersection(shapely.union_all([stays, between]).convex_hull), (first, last)
+    hull = shapely.union_all([*interfaces(domain), between]).convex_hull
+    return arm.intersection(hull).union(stays), (first, last)
 
 
 def _windows(

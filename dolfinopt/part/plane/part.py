@@ -50,7 +50,7 @@ TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of 
 
 @dataclass(frozen=True, eq=False)
 class PlanePart:
-    """The part of one arm in the plane, see `part.Part`.
+    """The part of one arm in the plane.
 
     Attributes:
         domain: the arm and its design.
@@ -66,7 +66,6 @@ class PlanePart:
 
     COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
-    has_curves: ClassVar[bool] = True
 
     @property
     def name(self) -> str:
@@ -192,14 +191,28 @@ class PlanePart:
         yield ".stl", triangle_bytes(MM * self.facets, f"{title}, mm")
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> BodyMesh:
-        """Return triangles along its curves, see `part.Part`."""
+        """Return triangles along its curves, on this process alone.
+
+        Args:
+            coarser: factor of the sides of all cells.
+            finer: places (n, d), m, near which arcs of a coarse mesh are divided finely, twice as
+                finely for every further array; None: finely everywhere.
+
+        Raises:
+            InputError: Gmsh cannot mesh it.
+        """
         try:
             return body_mesh(self.shape, self.domain.cell, coarser, finer)
         except InputError as error:
             raise InputError(f"arm {self.name!r}: {error}") from None
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
-        """Return which places (n, 2) are away from where stress has no limit (n,)."""
+        """Return which places (n, 2) are away from where stress has no limit (n,).
+
+        Args:
+            places: m.
+            margin: least distance from the interfaces, m.
+        """
         return is_regular_in_plane(self.shape, self.domain, places, margin)
 
     def stress(self, state: DesignState) -> CornerStress:

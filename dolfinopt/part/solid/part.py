@@ -48,7 +48,7 @@ HELD = 0.9  # of the mark of what stays solid, from which on points belong to it
 
 @dataclass(frozen=True, eq=False)
 class SolidPart:
-    """The part of one solid arm, see `part.Part`.
+    """The part of one solid arm, see `plane.part.PlanePart`.
 
     Attributes:
         domain: the arm and its design.
@@ -81,11 +81,6 @@ class SolidPart:
     def facets(self) -> np.ndarray:
         """Corners (n, 3, 3) of the triangles of its surface, m."""
         return self.surface.corners
-
-    @property
-    def has_curves(self) -> bool:
-        """Whether it is extruded; other surfaces are free-form, in triangles."""
-        return self.flat is not None
 
     @property
     def sentence(self) -> str:
@@ -224,7 +219,7 @@ class SolidPart:
             yield ".dxf", dxf_text(shape)
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> Tetrahedra:
-        """Return tetrahedra, all about as large, see `part.Part`."""
+        """Return tetrahedra, all about as large, see `PlanePart.mesh`."""
         return solid_mesh(self, coarser * mesh_size(self))
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
