@@ -134,9 +134,13 @@ def _windows(
     near = 1e-2 * (right - left)
     reach = [_extent(inside, at, low, high) for at in np.clip(x, left + near, right - near)]
     ends = [[b + 0.5 * flange, a - 0.5 * flange] for a, b in reach]
-    lines = [shapely.LineString([(x[k], ends[k][k % 2]) for k in range(bays + 1)])]
-    if symmetric:
-        lines.append(shapely.LineString([(x[k], ends[k][1 - k % 2]) for k in range(bays + 1)]))
+    # To and fro from edge to edge, beginning and ending with a post, which takes what flanges that
+    # run towards bores push across: without posts a SCARA's fore arm bends there, 2.1 for 0.71 mm.
+    way = [0, *range(bays + 1), bays]
+    lines = [
+        shapely.LineString([(x[k], ends[k][(i + side) % 2]) for i, k in enumerate(way)])
+        for side in range(1 + symmetric)
+    ]
     struts = shapely.union_all(lines).buffer(0.5 * strut, join_style="mitre")
     return inside.difference(struts)
 
