@@ -177,7 +177,7 @@ def make_hollow_part(mesh: ArmMesh, x_phys: np.ndarray, curves: Curves = DEFAULT
     Raises:
         InputError: curves are asked for.
     """
-    if not curves.is_default:
+    if curves != DEFAULTS:
         raise InputError(
             f"arm {mesh.name!r}: its wall's inner surface has no curves: leave out --tool-radius, "
             "--tolerance and --curves"

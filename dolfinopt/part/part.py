@@ -45,11 +45,6 @@ class Curves:
     tolerance: float | None = None
     rounds: bool = False
 
-    @property
-    def is_default(self) -> bool:
-        """Whether nothing is asked."""
-        return self == DEFAULTS
-
     def check(self) -> None:
         """Raise InputError where a length is out of range."""
         for name, value, least in (
@@ -117,7 +112,12 @@ def make_parts(
         }
     designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
     with together(world):
-        mine = {k: _tried(scene, k, mesh, designs[k], curves) for k, mesh in meshes.items()}
+        mine: dict[int, Part | InputError] = {}
+        for k, mesh in meshes.items():
+            try:
+                mine[k] = _part_of(scene, k, mesh, designs[k], curves)
+            except InputError as error:
+                mine[k] = error
     results: dict[int, Part | InputError] = {}
     for pieces in world.gather(mine, root=0) or ():
         results.update(pieces)
@@ -127,20 +127,6 @@ def make_parts(
             failed = [str(part) for part in results.values() if isinstance(part, InputError)]
             raise PartsError("; ".join(failed), parts)
     return parts
-
-
-def _tried(
-    scene: Scene,
-    index: int,
-    mesh: ArmMesh,
-    design: tuple[np.ndarray, np.ndarray | None],
-    curves: Curves,
-) -> Part | InputError:
-    """Return the part of an arm, or why there is none."""
-    try:
-        return _made(scene, index, mesh, design, curves)
-    except InputError as error:
-        return error
 
 
 def _check(folder: Path, curves: Curves) -> None:
@@ -153,7 +139,7 @@ def _check(folder: Path, curves: Curves) -> None:
         )
 
 
-def _made(
+def _part_of(
     scene: Scene,
     index: int,
     mesh: ArmMesh,

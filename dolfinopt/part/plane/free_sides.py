@@ -12,7 +12,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import BodyMesh, PlateMesh, extruded
-from dolfinopt.part.plane.curves import Curve, Line
+from dolfinopt.part.plane.curves import Curve, Line, angle_of, left, unit
 from dolfinopt.part.plane.limits import Limits
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import (
@@ -21,9 +21,6 @@ from dolfinopt.part.plane.sides import (
     Loop,
     Side,
     Sides,
-    angle_of,
-    left,
-    unit,
 )
 from dolfinopt.part.plane.simpler import simplifications
 from dolfinopt.part.solid.part import SolidPart, plate_part

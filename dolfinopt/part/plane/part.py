@@ -15,7 +15,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import SAME_VOLUME, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
-from dolfinopt.part.plane.curves import MM, Concave, Shape
+from dolfinopt.part.plane.curves import HALVINGS, MM, Concave, Shape, cross
 from dolfinopt.part.plane.fit import distance, fitted_sides
 from dolfinopt.part.plane.limits import (
     KEPT,
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from dolfinopt.part.stress import CornerStress
 
 
-TOLD = 5  # tight places that a sentence names
-QUARTERS = 6  # of the chords' distance, at most, for the volume within them
 TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
 
 
@@ -133,11 +131,10 @@ class PlanePart:
                 f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
             )
         if self.tight:
-            listed = "; ".join(map(str, self.tight[:TOLD]))
-            more = f"; {len(self.tight) - TOLD} more in part.json" if len(self.tight) > TOLD else ""
+            listed = "; ".join(map(str, self.tight))
             tool = MM * outline.tool_radius
             result.append(
-                f"arm {domain.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
+                f"arm {domain.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}"
             )
         least = domain.minimum_member or THIN
         if self.thinnest is not None and self.thinnest < NARROW * least:
@@ -228,9 +225,9 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
         thickness: upwards, m.
         chord: largest distance of the triangles from the curves, m; less where the volume asks.
     """
-    for _ in range(QUARTERS):
+    for _ in range(HALVINGS):
         loops = shape.polygons(chord)
-        area = sum(0.5 * np.cross(loop, np.roll(loop, -1, axis=0)).sum() for loop in loops)
+        area = sum(0.5 * cross(loop, np.roll(loop, -1, axis=0)).sum() for loop in loops)
         if abs(area - shape.area) <= SAME_VOLUME * shape.area:
             break
         chord *= 0.25  # sides half as long
