@@ -15,7 +15,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import SAME_VOLUME, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
-from dolfinopt.part.plane.curves import HALVINGS, MM, Concave, Shape, cross
+from dolfinopt.part.plane.curves import MM, Concave, Shape, cross
 from dolfinopt.part.plane.fit import distance, fitted_sides
 from dolfinopt.part.plane.limits import (
     KEPT,
@@ -225,13 +225,12 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
         thickness: upwards, m.
         chord: largest distance of the triangles from the curves, m; less where the volume asks.
     """
-    for _ in range(HALVINGS):
+    while True:
         loops = shape.polygons(chord)
         area = sum(0.5 * cross(loop, np.roll(loop, -1, axis=0)).sum() for loop in loops)
         if abs(area - shape.area) <= SAME_VOLUME * shape.area:
-            break
+            return extruded_facets(loops, thickness)
         chord *= 0.25  # sides half as long
-    return extruded_facets(loops, thickness)
 
 
 def make_part(domain: Domain, curves: Curves = DEFAULTS, more: float = 1.0) -> PlanePart:
