@@ -2,8 +2,8 @@
 
 The polygon is cut where it comes to another curve of the arm. A free run is divided by Douglas and
 Peucker's rule, and each portion becomes its line of least squares. Sides that are too short for the
-fillets at their ends go. Of a symmetric arm the upper half is
-drawn and mirrored. At last the nearest outline is found that keeps the limits and the area.
+fillets at their ends go. Of a symmetric arm the upper half is drawn and mirrored. At last the
+nearest outline is found that keeps the limits and the area.
 Source: Douglas & Peucker (1973), doi:10.3138/FM57-6770-U75U-7727.
 """
 
@@ -569,7 +569,8 @@ def looped(
             continue
         half = _half(turn)
         ends = (places[k - 1], places[(k + 1) % len(places)])
-        room = 0.5 * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
+        # Less than half of a side: an arm that has the design at three quarters of the size, too.
+        room = 0.35 * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
         radius = max(min(radius_at(b, place, half), room), limits.tool, SHORT * limits.cell)
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
         near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)
