@@ -269,6 +269,8 @@ class PartsJob:
 
     def tell(self, target: Path) -> None:
         """Print what was made."""
+        from dolfinopt.part.solid.part import SolidPart
+
         scene, rough = self.scene, []
         for arm, owner in zip(scene.arms, scene.owners, strict=True):
             if owner is None:
@@ -277,7 +279,7 @@ class PartsJob:
             part = self.parts[owner]
             mass = scene.material_of(owner).density * part.volume
             click.echo(f"{arm.name}: {mass:.4g} kg, {part.sentence}")
-            if not part.has_curves and not scene.arms[owner].hollow:
+            if isinstance(part, SolidPart) and part.flat is None:
                 rough.append(arm.name)
         if self.check is not None:
             tell(self.check)

@@ -26,7 +26,6 @@ from dolfinopt.output.trajectory import drive_units
 from dolfinopt.part.buckling import LeastBuckling, lowest_buckling
 from dolfinopt.part.domain import ANOTHER
 from dolfinopt.part.folder import scene_data, toml_text
-from dolfinopt.part.part import Meshes, Part, PartMesh
 from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
     from dolfinopt.dynamics.build import Trajectory
     from dolfinopt.dynamics.collocation import Solution
     from dolfinopt.parallel import Partition
+    from dolfinopt.part.part import Meshes, Part, PartMesh
     from dolfinopt.responses.evaluation import Evaluation
 
 
@@ -304,7 +304,6 @@ class Check:
     """The machine with the densities, the crisp design and the parts.
 
     Attributes:
-        units: of the table's rows.
         density, crisp, part: the forms; None of a crisp design that falls apart.
         coarse: the part on a mesh with longer sides; None where there is none.
         stress_change: relative, of the largest stress by the last refinement where it is largest.
@@ -315,7 +314,6 @@ class Check:
         before: the parts before their shape was optimised; None where it was not.
     """
 
-    units: Mapping[str, str]
     density: Column
     crisp: Column | None
     part: Column
@@ -348,7 +346,7 @@ class Check:
 
         forms = [DENSITY, CRISP, *([PART] if self.before else []), self.form]
         rows = []
-        for name, unit in self.units.items():
+        for name, unit in self.part.units.items():
             values = [
                 self.columns[form].values[name] if form in self.columns else float("nan")
                 for form in forms
@@ -356,7 +354,7 @@ class Check:
             ratios = [_ratio(values[-1], other) - 1.0 for other in values[:2]]
             rows.append([unit, *values, *ratios])
         names = ["unit", *forms, "part/density", "part/crisp"]
-        return DataFrame(rows, columns=names, index=Index(self.units, name="figure"))
+        return DataFrame(rows, columns=names, index=Index(self.part.units, name="figure"))
 
     @cached_property
     def refinement(self) -> dict[str, float]:
@@ -364,9 +362,9 @@ class Check:
 
         That of the whole mesh; of stress by the last one where it is largest. NaN: not known.
         """
-        result = dict.fromkeys(self.units, float("nan"))
+        result = dict.fromkeys(self.part.units, float("nan"))
         if self.coarse is not None:
-            for name in self.units:
+            for name in self.part.units:
                 result[name] = _ratio(self.part.values[name], self.coarse.values[name]) - 1.0
         return result | {STRESS: self.stress_change}
 
@@ -378,7 +376,7 @@ class Check:
     @property
     def _judged(self) -> list[str]:
         """The figures that tell what a part loses: a pinned end has no deviation."""
-        return [name for name in ("compliance", "deviation") if name in self.units]
+        return [name for name in ("compliance", "deviation") if name in self.part.units]
 
     @property
     def stress_converged(self) -> bool:
@@ -488,7 +486,7 @@ class Check:
         table = {
             name: {"unit": unit}
             | {form: column.values[name] for form, column in self.columns.items()}
-            for name, unit in self.units.items()
+            for name, unit in self.part.units.items()
         }
         places = {
             form: column.stress.to_dict(column.stressed)
@@ -618,7 +616,6 @@ def check_parts(
     worst, at = largest_of({place: item.everywhere for place, item in stress.items()}, scene)
     grows = column.stress is not None and worst is not None and worst.value > column.stress.value
     return Check(
-        units=column.units,
         density=density,
         crisp=crisp,
         part=column,

@@ -22,7 +22,19 @@ from scipy.spatial import cKDTree
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.arm_mesh import ArmMesh, box_arm
 from dolfinopt.mesh.checks import cell_sizes, facet_corners
-from dolfinopt.part.plane.curves import DEGREE, Arc, Curve, Line, Spline, circle_through, sampled
+from dolfinopt.mesh.solid_cells import TENSOR
+from dolfinopt.part.plane.curves import (
+    DEGREE,
+    Arc,
+    Curve,
+    Line,
+    Spline,
+    angle_of,
+    circle_through,
+    cross,
+    sampled,
+    within_half_turn,
+)
 from dolfinopt.scene.load import Arm, Scene
 
 if TYPE_CHECKING:
@@ -80,8 +92,7 @@ def recognise(points: np.ndarray, labels: np.ndarray, extent: float) -> list[Edg
     if (labels == labels[0]).all() and (circle := _circle(points, near, closed=True)) is not None:
         return [Edge(circle, str(labels[0]))]
     before, after = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
-    cross = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    turn = np.arctan2(cross, (before * after).sum(axis=1))
+    turn = np.arctan2(cross(before, after), (before * after).sum(axis=1))
     stops = (np.abs(turn) > SHARPEST) | (labels != np.roll(labels, 1))
     first = int(np.argmax(stops))
     if not stops.any():  # somewhere within a curve: begin where that ends
@@ -143,20 +154,18 @@ def _straight(points: np.ndarray, near: float) -> bool:
     size = np.linalg.norm(along)
     if size == 0.0:
         return False
-    off = points - points[0]
-    return bool(np.abs(off[:, 0] * along[1] - off[:, 1] * along[0]).max() <= near * size)
+    return bool(np.abs(cross(points - points[0], along)).max() <= near * size)
 
 
 def _circle(points: np.ndarray, near: float, closed: bool = False) -> Arc | None:
     """Return the circle through points that follow one another on it, None where there is none."""
-    if len(points) < (8 if closed else FEWEST):
+    if len(points) < FEWEST:
         return None
     centre, radius, off = circle_through(points)
     if off > near or radius == 0.0:
         return None
-    angle = np.arctan2(*(points - centre).T[::-1])
-    steps = np.diff(np.append(angle, angle[0]) if closed else angle)
-    steps = (steps + np.pi) % (2.0 * np.pi) - np.pi
+    angle = angle_of(points - centre)
+    steps = within_half_turn(np.diff(np.append(angle, angle[0]) if closed else angle))
     if not ((steps > 0.0).all() or (steps < 0.0).all()) or np.abs(steps).max() > SHARPEST:
         return None
     sweep = float(steps.sum())
@@ -267,8 +276,7 @@ def cells_of(mesh: ArmMesh) -> Cells:
         around, after = [0, 1, 3, 2], [0, 2, 3, 1]
     nodes, facets = nodes[:, around], facets[:, after]
     corner = points[nodes]
-    ahead = np.roll(corner, -1, axis=1)
-    turned = (corner[..., 0] * ahead[..., 1] - corner[..., 1] * ahead[..., 0]).sum(axis=1) < 0.0
+    turned = cross(corner, np.roll(corner, -1, axis=1)).sum(axis=1) < 0.0
     back = np.arange(nodes.shape[1])[::-1]
     nodes = np.where(turned[:, None], nodes[:, back], nodes)
     facets = np.where(turned[:, None], facets[:, np.roll(back, -1)], facets)
@@ -542,7 +550,6 @@ def _links(
 
 
 ROUNDING = 1e-6  # of densities over the thickness of a design that is extruded; of a cell
-AROUND = [0, 1, 3, 2]  # from a tensor product's corners of a quadrilateral to those around it
 
 
 @dataclass(frozen=True, eq=False)
@@ -648,7 +655,7 @@ def solid_domain(mesh: ArmMesh, x_phys: np.ndarray, field: np.ndarray | None = N
     facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
     around = np.array(facet_corners(3, corners.shape[1]))
     if around.shape[1] == 4:
-        around = around[:, AROUND]
+        around = around[:, TENSOR[4, 2]]
     stays = ~mesh.void
     corners, facets = corners[stays], facets[stays]
     passive, count = mesh.passive[stays], int(facets.max()) + 1

@@ -38,7 +38,7 @@ VERTICES = np.array([[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in 
 
 @dataclass(frozen=True, eq=False)
 class WallMesh(Member):
-    """A wall's cells, see `part.PartMesh`."""
+    """A wall's cells."""
 
     kind: ClassVar[str] = "hexahedra"
 
@@ -54,7 +54,7 @@ class WallMesh(Member):
 
 @dataclass(frozen=True, eq=False)
 class HollowPart:
-    """The part of one hollow arm, see `part.Part`.
+    """The part of one hollow arm, see `plane.part.PlanePart`.
 
     Attributes:
         name: the arm's.
@@ -83,11 +83,6 @@ class HollowPart:
     def facets(self) -> np.ndarray:
         """Corners (n, 3, 3) of the triangles of its surface, m."""
         return self.surface.corners
-
-    @property
-    def has_curves(self) -> bool:
-        """None: its inner surface is free-form."""
-        return False
 
     @property
     def volume(self) -> float:
@@ -142,7 +137,7 @@ class HollowPart:
         yield ".3mf", three_mf_bytes(self.surface, name)
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> WallMesh:
-        """Return hexahedra: the design's, or a quarter of each, see `part.Part`."""
+        """Return hexahedra: the design's, or a quarter of each, see `PlanePart.mesh`."""
         hull, thickness = self.hull, self.thickness
         if coarser < self.COARSER:
             grid = hull.points(thickness).reshape(2, *hull.outer.shape)
@@ -182,7 +177,7 @@ def make_hollow_part(mesh: ArmMesh, x_phys: np.ndarray, curves: Curves = DEFAULT
     Raises:
         InputError: curves are asked for.
     """
-    if not curves.is_default:
+    if curves != DEFAULTS:
         raise InputError(
             f"arm {mesh.name!r}: its wall's inner surface has no curves: leave out --tool-radius, "
             "--tolerance and --curves"

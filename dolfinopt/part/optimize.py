@@ -13,13 +13,13 @@ import gc
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import Column, refined
 from dolfinopt.part.folder import Forms, Saved
-from dolfinopt.part.part import Curves, Meshes, Part, mesh_parts
+from dolfinopt.part.part import Curves, Meshes, mesh_parts
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
@@ -30,6 +30,9 @@ from dolfinopt.part.solid.part import SolidPart
 from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.response import objective_of
 from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.part.part import Part
 
 REPAIRS = 3  # times that limits missed in the end are met by further steps
 # Times the design's volume that contours enclose with which a search may begin. Struts that are

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -17,9 +17,15 @@ from dolfinopt.scene.load import Scene
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.arms.design_state import DesignState
     from dolfinopt.mesh.arm_mesh import ArmMesh
-    from dolfinopt.part.stress import CornerStress
+    from dolfinopt.mesh.solid_cells import Tetrahedra
+    from dolfinopt.part.hollow import HollowPart, WallMesh
+    from dolfinopt.part.mesh import BodyMesh
+    from dolfinopt.part.plane.part import PlanePart
+    from dolfinopt.part.solid.part import SolidPart
+
+    Part: TypeAlias = PlanePart | SolidPart | HollowPart
+    PartMesh: TypeAlias = BodyMesh | Tetrahedra | WallMesh
 
 
 FINEST = 1e-7  # m, the finest tolerance of curves: that of CAD programs
@@ -38,11 +44,6 @@ class Curves:
     tool_radius: float | None = None
     tolerance: float | None = None
     rounds: bool = False
-
-    @property
-    def is_default(self) -> bool:
-        """Whether nothing is asked."""
-        return self == DEFAULTS
 
     def check(self) -> None:
         """Raise InputError where a length is out of range."""
@@ -68,94 +69,6 @@ class PartsError(InputError):
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str]]:
         return InputError, (str(self),)  # on other ranks, which have none
-
-
-class PartMesh(Protocol):
-    """A mesh of a part: triangles or tetrahedra."""
-
-    kind: ClassVar[str]
-
-    @property
-    def points(self) -> np.ndarray:
-        """(n, d) m."""
-
-    @property
-    def cells(self) -> np.ndarray:
-        """(m, d + 1) corners of the cells."""
-
-    def figures(self) -> dict[str, Any]:
-        """Return its entry of part.json."""
-
-    def write(self, path: Path) -> None:
-        """Write it as `arms.mesh` reads it back (.msh)."""
-
-
-class Part(Protocol):
-    """The part of one arm.
-
-    Attributes:
-        COARSER: sides of the cells of the mesh with which the one of its scene is compared.
-        REFINEMENTS: of its mesh where stress is largest, at most.
-    """
-
-    COARSER: ClassVar[float]
-    REFINEMENTS: ClassVar[int]
-
-    @property
-    def name(self) -> str:
-        """The arm's name."""
-
-    @property
-    def volume(self) -> float:
-        """Of the part, m3."""
-
-    @property
-    def facets(self) -> np.ndarray:
-        """Corners (n, 3, 3) of the triangles of its surface, counterclockwise from outside, m."""
-
-    @property
-    def has_curves(self) -> bool:
-        """Whether it is made of curves, as STEP and DXF know them."""
-
-    @property
-    def warnings(self) -> list[str]:
-        """What the workshop or the designer should know, a sentence each."""
-
-    @property
-    def sentence(self) -> str:
-        """Its size in words."""
-
-    def figures(self, density: float) -> dict[str, Any]:
-        """Return the entry of part.json; `density` of the material in kg/m3."""
-
-    def keys(self) -> dict[str, Any]:
-        """Return the keys of its arm in part.toml, but for the mesh."""
-
-    def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
-        """Yield how the names of its files end, and what they hold; `name` and title of it."""
-
-    def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> PartMesh:
-        """Return a mesh of it, on this process alone.
-
-        Args:
-            coarser: factor of the sides of all cells.
-            finer: places (n, d), m, near which arcs of a coarse mesh are divided finely, twice as
-                finely for every further array; None: finely everywhere.
-
-        Raises:
-            InputError: Gmsh cannot mesh it.
-        """
-
-    def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
-        """Return which places (n, d) are away from where stress has no limit (n,).
-
-        Args:
-            places: m.
-            margin: least distance from the interfaces, m.
-        """
-
-    def stress(self, state: DesignState) -> CornerStress:
-        """Return the stress at the corners of the cells of an arm with such a mesh."""
 
 
 def make_parts(
@@ -199,7 +112,12 @@ def make_parts(
         }
     designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
     with together(world):
-        mine = {k: _tried(scene, k, mesh, designs[k], curves) for k, mesh in meshes.items()}
+        mine: dict[int, Part | InputError] = {}
+        for k, mesh in meshes.items():
+            try:
+                mine[k] = _part_of(scene, k, mesh, designs[k], curves)
+            except InputError as error:
+                mine[k] = error
     results: dict[int, Part | InputError] = {}
     for pieces in world.gather(mine, root=0) or ():
         results.update(pieces)
@@ -209,20 +127,6 @@ def make_parts(
             failed = [str(part) for part in results.values() if isinstance(part, InputError)]
             raise PartsError("; ".join(failed), parts)
     return parts
-
-
-def _tried(
-    scene: Scene,
-    index: int,
-    mesh: ArmMesh,
-    design: tuple[np.ndarray, np.ndarray | None],
-    curves: Curves,
-) -> Part | InputError:
-    """Return the part of an arm, or why there is none."""
-    try:
-        return _made(scene, index, mesh, design, curves)
-    except InputError as error:
-        return error
 
 
 def _check(folder: Path, curves: Curves) -> None:
@@ -235,7 +139,7 @@ def _check(folder: Path, curves: Curves) -> None:
         )
 
 
-def _made(
+def _part_of(
     scene: Scene,
     index: int,
     mesh: ArmMesh,

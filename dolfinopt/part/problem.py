@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.part.check import STRESS, Simulated, simulate_parts
 from dolfinopt.part.mesh import BodyMesh, PlateMesh
-from dolfinopt.part.part import Part, PartMesh
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.stress import HOT, CornerStress, OutlineStress
 from dolfinopt.profiling import Profile
@@ -23,6 +22,9 @@ from dolfinopt.responses.products import by_nodes
 from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress import arm_loads, maxima, motions_of
 from dolfinopt.scene.load import Scene
+
+if TYPE_CHECKING:
+    from dolfinopt.part.part import Part, PartMesh
 
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
@@ -106,7 +108,7 @@ class Problem:
         parts: as they were, of the arms that repeat another's design, too.
         tightened: factor by the name of a limit, by which its value counts more.
         local: stress of a place on a finer mesh, over its limit, by the p-mean on this one, 1/Pa.
-        finer: places of every arm where its mesh is finer, see `part.Part.mesh`.
+        finer: places of every arm where its mesh is finer, see `PlanePart.mesh`.
         stiffening: whether bodies have geometric stiffness; None: as the scene states.
     """
 

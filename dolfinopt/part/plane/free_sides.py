@@ -12,7 +12,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import BodyMesh, PlateMesh, extruded
-from dolfinopt.part.plane.curves import Curve, Line
+from dolfinopt.part.plane.curves import Curve, Line, angle_of, left, unit
 from dolfinopt.part.plane.limits import Limits
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import (
@@ -21,9 +21,6 @@ from dolfinopt.part.plane.sides import (
     Loop,
     Side,
     Sides,
-    angle_of,
-    left,
-    unit,
 )
 from dolfinopt.part.plane.simpler import simplifications
 from dolfinopt.part.solid.part import SolidPart, plate_part
@@ -106,7 +103,7 @@ class FreeSides:
         return None if result is None else (replace(self, sides=result[0]), result[1])
 
     def meshed(self, finer: Sequence[np.ndarray]) -> Mesh:
-        """Return a new mesh of it, see `part.Part.mesh`."""
+        """Return a new mesh of it, see `PlanePart.mesh`."""
         return self.current.mesh(finer=finer)
 
     def followed(self, mesh: Mesh) -> Mesh | None:

@@ -16,8 +16,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.part.domain import Domain
 from dolfinopt.part.plane.fit import fitted_sides
-from dolfinopt.part.plane.limits import limits_of_part
+from dolfinopt.part.plane.limits import Limits, interfaces, limits_of_part
 from dolfinopt.part.plane.outline import AREA, polygons_of
 from dolfinopt.part.plane.part import PlanePart
 
@@ -55,7 +56,7 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     domain, drawn = part.domain, part.outline
     limits = limits_of_part(domain, drawn.tool_radius)
     stays = limits.stays
-    arm, span = _between_bores(limits.arm, stays)
+    arm, span = _between_bores(domain, limits)
     fillet = max(domain.cell, drawn.tool_radius)
 
     def rounded(hole: Geometry) -> Geometry:
@@ -88,17 +89,20 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     return replace(part, outline=result, sides=sides)
 
 
-def _between_bores(arm: Geometry, stays: Geometry) -> tuple[Geometry, tuple[float, float]]:
+def _between_bores(domain: Domain, limits: Limits) -> tuple[Geometry, tuple[float, float]]:
     """Return an arm without what lies beyond bores at its ends, and from where to where bays go."""
-    # Flanges run straight from a bore's ring to the arm's own edges where the bays begin.
+    # Flanges run straight from the arm's own edges where the bays begin towards bores. Tangents of
+    # the rings around those would leave no corner that could move.
     import shapely
 
+    arm, stays = limits.arm, limits.stays
     left, low, right, high = arm.bounds
     middle, rings = 0.5 * (left + right), [item.bounds for item in polygons_of(stays)]
     first = max((box[2] for box in rings if box[2] < middle), default=left)
     last = min((box[0] for box in rings if box[0] > middle), default=right)
     between = arm.intersection(shapely.box(first, low, last, high))
-    return arm.intersection(shapely.union_all([stays, between]).convex_hull), (first, last)
+    hull = shapely.union_all([*interfaces(domain), between]).convex_hull
+    return arm.intersection(hull).union(stays), (first, last)
 
 
 def _windows(
@@ -130,9 +134,13 @@ def _windows(
     near = 1e-2 * (right - left)
     reach = [_extent(inside, at, low, high) for at in np.clip(x, left + near, right - near)]
     ends = [[b + 0.5 * flange, a - 0.5 * flange] for a, b in reach]
-    lines = [shapely.LineString([(x[k], ends[k][k % 2]) for k in range(bays + 1)])]
-    if symmetric:
-        lines.append(shapely.LineString([(x[k], ends[k][1 - k % 2]) for k in range(bays + 1)]))
+    # To and fro from edge to edge, beginning and ending with a post, which takes what flanges that
+    # run towards bores push across: without posts a SCARA's fore arm bends there, 2.1 for 0.71 mm.
+    way = [0, *range(bays + 1), bays]
+    lines = [
+        shapely.LineString([(x[k], ends[k][(i + side) % 2]) for i, k in enumerate(way)])
+        for side in range(1 + symmetric)
+    ]
     struts = shapely.union_all(lines).buffer(0.5 * strut, join_style="mitre")
     return inside.difference(struts)
 

@@ -25,8 +25,12 @@ from dolfinopt.part.plane.curves import (
     Line,
     Piece,
     Spline,
+    angle_of,
     direction,
+    left,
     sampled,
+    unit,
+    within_half_turn,
 )
 from dolfinopt.part.plane.sides import (
     ArcMoves,
@@ -35,7 +39,6 @@ from dolfinopt.part.plane.sides import (
     OwnMoves,
     Placed,
     Sides,
-    unit,
 )
 from dolfinopt.part.program import least_move
 
@@ -44,8 +47,6 @@ if TYPE_CHECKING:
 
 SHORT = 0.05  # least length of a side, cells
 TURN, MOST_TURN = np.radians(4.0), np.radians(172.0)  # of the outline at a corner
-NEARLY = 2.0  # of the least length or turn, up to which a side vanishes, a corner hardly turns
-LARGEST = 8.0  # radius of a fillet, cells
 THIN = 1e-3  # m, least width of members unless the scene states one
 NARROW = 0.9  # of the width asked for, below which a member or gap is told
 FACING = 0.8  # cosine between a width and the normals at both of its ends, at least
@@ -114,7 +115,6 @@ class Limits:
             if isinstance(moves, ArcMoves):
                 assert isinstance(curve, Arc)
                 yield self.tool - curve.radius, -moves.radius
-                yield curve.radius - LARGEST * self.cell, moves.radius
             elif isinstance(moves, LineMoves):
                 side = sides.loops[item.loop].sides[item.side]
                 d = unit(side.angle) if side.curve is None else direction(side.curve, 0.0)
@@ -393,15 +393,12 @@ def _closest(curves: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray,
     size, is_arc = np.linalg.norm(v, axis=1), (sweep != 0.0)[:, None]
     r = p - s
     along = (r * v).sum(axis=1) / size**2
-    turned = np.arctan2(r[:, 1], r[:, 0]) - begin - 0.5 * sweep  # from the arc's middle
-    turned = (turned + np.pi) % (2.0 * np.pi) - np.pi
+    turned = within_half_turn(angle_of(r) - begin - 0.5 * sweep)  # from the arc's middle
     turned = 0.5 + np.divide(turned, sweep, out=np.zeros_like(sweep), where=sweep != 0.0)
     t = np.clip(np.where(is_arc[:, 0], turned, along), 0.0, 1.0)
-    angle = begin + sweep * t
-    out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    out = unit(begin + sweep * t)
     at = s + np.where(is_arc, size[:, None] * out, t[:, None] * v)
-    right = np.stack([v[:, 1], -v[:, 0]], axis=1) / size[:, None]
-    return t, at, np.where(is_arc, np.sign(sweep)[:, None] * out, right)
+    return t, at, np.where(is_arc, np.sign(sweep)[:, None] * out, -left(v) / size[:, None])
 
 
 def _signed(region: Geometry, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.part.domain import Domain
 from dolfinopt.part.mesh import SAME_VOLUME, BodyMesh, body_mesh
 from dolfinopt.part.part import DEFAULTS, Curves
-from dolfinopt.part.plane.curves import MM, Concave, Shape
+from dolfinopt.part.plane.curves import MM, Concave, Shape, cross
 from dolfinopt.part.plane.fit import distance, fitted_sides
 from dolfinopt.part.plane.limits import (
     KEPT,
@@ -43,14 +43,12 @@ if TYPE_CHECKING:
     from dolfinopt.part.stress import CornerStress
 
 
-TOLD = 5  # tight places that a sentence names
-QUARTERS = 6  # of the chords' distance, at most, for the volume within them
 TOLERANCE, CELLS = 1e-4, 0.1  # of the outline's polygon: 0.1 mm, or a tenth of a cell if less
 
 
 @dataclass(frozen=True, eq=False)
 class PlanePart:
-    """The part of one arm in the plane, see `part.Part`.
+    """The part of one arm in the plane.
 
     Attributes:
         domain: the arm and its design.
@@ -66,7 +64,6 @@ class PlanePart:
 
     COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
-    has_curves: ClassVar[bool] = True
 
     @property
     def name(self) -> str:
@@ -134,11 +131,10 @@ class PlanePart:
                 f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
             )
         if self.tight:
-            listed = "; ".join(map(str, self.tight[:TOLD]))
-            more = f"; {len(self.tight) - TOLD} more in part.json" if len(self.tight) > TOLD else ""
+            listed = "; ".join(map(str, self.tight))
             tool = MM * outline.tool_radius
             result.append(
-                f"arm {domain.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}{more}"
+                f"arm {domain.name!r}: a tool of radius {tool:.3g} mm does not reach {listed}"
             )
         least = domain.minimum_member or THIN
         if self.thinnest is not None and self.thinnest < NARROW * least:
@@ -192,14 +188,28 @@ class PlanePart:
         yield ".stl", triangle_bytes(MM * self.facets, f"{title}, mm")
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> BodyMesh:
-        """Return triangles along its curves, see `part.Part`."""
+        """Return triangles along its curves, on this process alone.
+
+        Args:
+            coarser: factor of the sides of all cells.
+            finer: places (n, d), m, near which arcs of a coarse mesh are divided finely, twice as
+                finely for every further array; None: finely everywhere.
+
+        Raises:
+            InputError: Gmsh cannot mesh it.
+        """
         try:
             return body_mesh(self.shape, self.domain.cell, coarser, finer)
         except InputError as error:
             raise InputError(f"arm {self.name!r}: {error}") from None
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
-        """Return which places (n, 2) are away from where stress has no limit (n,)."""
+        """Return which places (n, 2) are away from where stress has no limit (n,).
+
+        Args:
+            places: m.
+            margin: least distance from the interfaces, m.
+        """
         return is_regular_in_plane(self.shape, self.domain, places, margin)
 
     def stress(self, state: DesignState) -> CornerStress:
@@ -215,13 +225,12 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
         thickness: upwards, m.
         chord: largest distance of the triangles from the curves, m; less where the volume asks.
     """
-    for _ in range(QUARTERS):
+    while True:
         loops = shape.polygons(chord)
-        area = sum(0.5 * np.cross(loop, np.roll(loop, -1, axis=0)).sum() for loop in loops)
+        area = sum(0.5 * cross(loop, np.roll(loop, -1, axis=0)).sum() for loop in loops)
         if abs(area - shape.area) <= SAME_VOLUME * shape.area:
-            break
+            return extruded_facets(loops, thickness)
         chord *= 0.25  # sides half as long
-    return extruded_facets(loops, thickness)
 
 
 def make_part(domain: Domain, curves: Curves = DEFAULTS, more: float = 1.0) -> PlanePart:

@@ -35,10 +35,14 @@ from dolfinopt.part.plane.curves import (
     Piece,
     Shape,
     Spline,
+    angle_of,
+    cross,
     curvature,
     direction,
+    left,
     projected,
     turn_between,
+    unit,
 )
 
 PARALLEL = 1e-4  # sine of the angle between two sides below which they do not meet
@@ -48,21 +52,6 @@ CLOSE = 1e-13  # m, last of these steps
 
 class BrokenError(Exception):
     """The sides do not close to a loop."""
-
-
-def unit(angle: float) -> np.ndarray:
-    """Return the unit vector (2,) at an angle, rad."""
-    return np.array([np.cos(angle), np.sin(angle)])
-
-
-def left(v: np.ndarray) -> np.ndarray:
-    """Return a vector (2,) turned by a right angle to the left."""
-    return np.array([-v[1], v[0]])
-
-
-def angle_of(v: np.ndarray) -> float:
-    """Return the angle of a vector (2,), rad."""
-    return float(np.arctan2(v[1], v[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +129,7 @@ class Loop:
     @property
     def area(self) -> float:
         """Area within its corners, m2, positive counterclockwise."""
-        x, y = self.places.T
-        return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))
+        return 0.5 * float(cross(self.places, np.roll(self.places, -1, axis=0)).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,10 +153,9 @@ def meet(a: Side, b: Side, reach: float, near: np.ndarray) -> np.ndarray:
         feet = a.foot(place), b.foot(place)
         normals = np.array([-left(along) for _, along, _ in feet])
         gaps = [reach - n @ (place - foot) for n, (foot, _, _) in zip(normals, feet, strict=True)]
-        (p, q), (r, s) = normals
-        if abs(sine := p * s - q * r) < PARALLEL:
+        if abs(cross(*normals)) < PARALLEL:
             break
-        step = np.array([s * gaps[0] - q * gaps[1], p * gaps[1] - r * gaps[0]]) / sine
+        step = np.linalg.solve(normals, gaps)
         place = place + step
         if np.abs(step).max() < CLOSE:
             return place
@@ -220,11 +207,10 @@ class ArcMoves:
 
         With a count of sides it is that of nodes of a mesh, which stand off the arc (`Arc.off`).
         """
-        angle = curve.begin + curve.sweep * t
-        out = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        out = unit(curve.begin + curve.sweep * t)
         share, slope = curve.off(t, count)
         turns = np.outer((g * out).sum(axis=2) @ (curve.radius * slope), self.end - self.start)
-        along = (g * np.stack([-out[:, 1], out[:, 0]], axis=1)).sum(axis=2)
+        along = (g * left(out)).sum(axis=2)
         along = along * (curve.radius * share)
         return (
             g.sum(axis=1) @ self.centre
@@ -519,9 +505,8 @@ class Sides:
         """Return the derivative (n,) of the area by q: the integral of dp . outward ds, m."""
         result = np.zeros(self.numbers[0])
         for item in self.placed:
-            d = item.piece.curve.derivative(GAUSS)
-            out = np.stack([d[:, 1], -d[:, 0]], axis=1) * WEIGHTS[:, None]
-            result += item.pull(GAUSS, out[None])[0]
+            inwards = left(item.piece.curve.derivative(GAUSS)) * WEIGHTS[:, None]
+            result -= item.pull(GAUSS, inwards[None])[0]
         return result
 
 

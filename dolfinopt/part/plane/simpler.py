@@ -1,20 +1,19 @@
 """Other layouts of a part: without sides that vanish and holes that close.
 
-A search moves sides until limits of the geometry hold them: a side at its least length, a corner
-at its least turn, a hole at its smallest. Without them the outline is simpler, and free to move on.
+A search moves sides until limits of the geometry hold them: a side at its least length, a hole at
+its smallest. Without them the outline is simpler, and free to move on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from dolfinopt.part.plane.curves import turn_between
 from dolfinopt.part.plane.fit import Drawn, cleaned, looped, without
-from dolfinopt.part.plane.limits import NEARLY, SHORT, TURN, Limits
-from dolfinopt.part.plane.sides import Sides, unit
+from dolfinopt.part.plane.limits import SHORT, Limits
+from dolfinopt.part.plane.sides import Sides
 
 SMALL = 20.0  # area of a hole that may close, squared cells or tool radii
 
@@ -24,15 +23,13 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
     done: set[int] = set()
     for i in range(len(sides.loops)):
         drawn = _drawn(sides, i)
-        for item, after in zip(drawn, [*drawn[1:], drawn[0]], strict=True):
+        nearly = 2.0 * SHORT * limits.cell  # of its least length
+        for item in drawn:
             if not item.side.free or item.side.key in done or len(drawn) < 4:
                 continue
             done |= item.names
-            if np.linalg.norm(item.end - item.start) < NEARLY * SHORT * limits.cell:
-                yield from _without(sides, item.names, {}, limits, outer)
-            turn = abs(turn_between(unit(item.side.angle), unit(after.side.angle)))
-            if after.side.free and turn < NEARLY * TURN and not after.names & item.names:
-                yield from _without(sides, after.names, item.joined(after), limits, outer)
+            if np.linalg.norm(item.end - item.start) < nearly:
+                yield from _without(sides, item.names, limits, outer)
     yield from _without_holes(sides, SMALL * max(limits.cell, limits.tool) ** 2)
 
 
@@ -58,10 +55,8 @@ def _drawn(sides: Sides, i: int) -> list[Drawn]:
     ]
 
 
-def _without(
-    sides: Sides, gone: set[int], new: Mapping[int, Drawn], limits: Limits, outer: int
-) -> Iterator[Sides]:
-    """Yield the outline without sides of some keys and with others in place of some."""
+def _without(sides: Sides, gone: set[int], limits: Limits, outer: int) -> Iterator[Sides]:
+    """Yield the outline without sides of some keys."""
     radii = {
         side.key: corner.radius
         for loop in sides.loops
@@ -70,8 +65,8 @@ def _without(
     }
     loops = []
     for i, loop in enumerate(sides.loops):
-        if not (gone | new.keys()).isdisjoint(side.key for side in loop.sides):
-            kept = cleaned(without(_drawn(sides, i), gone, new), limits)
+        if not gone.isdisjoint(side.key for side in loop.sides):
+            kept = cleaned(without(_drawn(sides, i), gone), limits)
             if len(kept) < 3:
                 return
             loop = looped(kept, limits, outer, lambda side, *_: radii.get(side.key, limits.tool))

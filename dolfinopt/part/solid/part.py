@@ -27,7 +27,6 @@ from dolfinopt.part.solid.surface import (
     cavities,
     check_surface,
     crossings,
-    open_edges,
     outside,
     smooth_surface,
     with_volume,
@@ -42,13 +41,12 @@ if TYPE_CHECKING:
 
 
 FURTHEST = 0.5  # cells that a point of the part may be from where the isosurface has it
-LEAST_SHARE = 0.2  # of the smoothing that is left, below which all of it is taken back
 HELD = 0.9  # of the mark of what stays solid, from which on points belong to its faces
 
 
 @dataclass(frozen=True, eq=False)
 class SolidPart:
-    """The part of one solid arm, see `part.Part`.
+    """The part of one solid arm, see `plane.part.PlanePart`.
 
     Attributes:
         domain: the arm and its design.
@@ -83,11 +81,6 @@ class SolidPart:
         return self.surface.corners
 
     @property
-    def has_curves(self) -> bool:
-        """Whether it is extruded; other surfaces are free-form, in triangles."""
-        return self.flat is not None
-
-    @property
     def sentence(self) -> str:
         """Its size in words."""
         rows = f"{len(self.surface.triangles)} triangles"
@@ -118,21 +111,6 @@ class SolidPart:
         if self.flat is None:
             return self.surface.volume
         return self.flat.shape.area * self.flat.domain.thickness
-
-    @property
-    def watertight(self) -> bool:
-        """Whether the surface is closed and does not cross itself."""
-        return self.closed and self.crossings == 0
-
-    @cached_property
-    def crossings(self) -> int:
-        """Number of pairs of triangles that cross; none of plates, whose outline is checked."""
-        return len(crossings(self.surface)) if self.flat is None else 0
-
-    @property
-    def closed(self) -> bool:
-        """Whether every edge has two triangles, which run along it in opposite directions."""
-        return not len(open_edges(self.surface))
 
     @cached_property
     def cavities(self) -> np.ndarray:
@@ -191,7 +169,6 @@ class SolidPart:
             "level": self.level,
             "distance": self.distance,
             "triangles": len(self.surface.triangles),
-            "watertight": self.watertight,
             "extruded": self.flat is not None,
             "thinnest_member": self.widths.member,
             "narrowest_gap": self.widths.gap,
@@ -224,7 +201,7 @@ class SolidPart:
             yield ".dxf", dxf_text(shape)
 
     def mesh(self, coarser: float = 1.0, finer: Sequence[np.ndarray] | None = None) -> Tetrahedra:
-        """Return tetrahedra, all about as large, see `part.Part`."""
+        """Return tetrahedra, all about as large, see `PlanePart.mesh`."""
         return solid_mesh(self, coarser * mesh_size(self))
 
     def regular(self, places: np.ndarray, margin: float) -> np.ndarray:
@@ -244,7 +221,7 @@ def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart
             are asked for that it has not.
     """
     if domain.flat is None:
-        if not curves.is_default:
+        if curves != DEFAULTS:
             raise InputError(
                 f"arm {domain.name!r}: its design varies over the thickness, so that its part has "
                 "no curves: leave out --tool-radius, --tolerance and --round, or optimise with "
@@ -297,19 +274,17 @@ def _freeform_part(domain: SolidDomain) -> SolidPart:
 
 def _uncrossed(surface: Surface, smooth: Surface, free: np.ndarray, volume: float) -> Surface:
     """Return the smoothed surface with a volume, less smooth where it would cross itself."""
-    # The isosurface does not cross itself. Points of triangles that do go back towards it by
-    # halves, those beside them with them, and all the way at last; the others make up for the
-    # volume. `free` (n,) is True of points that move.
-    share = np.ones(len(surface.points))
-    move = smooth.points - surface.points
+    # The isosurface does not cross itself. Points of triangles that do go back to it, those beside
+    # them with them; the others make up for the volume. `free` (n,) is True of points that move.
+    moves = free
     for _ in range(ROUNDS):
-        now = replace(surface, points=surface.points + share[:, None] * move)
-        result = with_volume(now, free & (share > 0.0), volume)
+        points = np.where(moves[:, None], smooth.points, surface.points)
+        result = with_volume(replace(surface, points=points), moves, volume)
         crossed = crossings(result)
         if not len(crossed):
             break
-        near = np.zeros(len(share), dtype=bool)
+        near = np.zeros(len(points), dtype=bool)
         near[surface.triangles[crossed]] = True
         near[surface.triangles[near[surface.triangles].any(axis=1)]] = True
-        share = np.where(near, np.where(share > LEAST_SHARE, 0.5 * share, 0.0), share)
+        moves = moves & ~near
     return result

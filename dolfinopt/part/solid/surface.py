@@ -20,15 +20,11 @@ from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_sizes
+from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.plane.curves import MM
 
 APART = 0.005  # least difference of a node's density from the level
-# Corners of a hexahedron, from a tensor product's order to VTK's.
-AROUND = {4: [0, 1, 2, 3], 8: [0, 1, 3, 2, 4, 5, 7, 6]}
-
-MIRRORED = {4: [0, 2, 1, 3], 8: [4, 5, 6, 7, 0, 1, 2, 3]}
-MIRRORED[27] = [*range(18, 27), *range(9, 18), *range(9)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +170,7 @@ def _grid(points: np.ndarray, nodes: np.ndarray) -> Any:
 
     count = nodes.shape[1]
     kind = pyvista.CellType.TETRA if count == 4 else pyvista.CellType.HEXAHEDRON
-    return pyvista.UnstructuredGrid({kind: nodes[:, AROUND[count]]}, points)
+    return pyvista.UnstructuredGrid({kind: nodes[:, TENSOR[count, 3]]}, points)
 
 
 def _centre_faces(grid: np.ndarray, corners: np.ndarray, axis: int) -> None:
@@ -191,7 +187,11 @@ def _centre_faces(grid: np.ndarray, corners: np.ndarray, axis: int) -> None:
 def _right_handed(corners: np.ndarray, nodes: np.ndarray) -> np.ndarray:
     """Return nodes (n, ...) of cells with corners (n, 4 or 8, 3), left-handed ones mirrored."""
     edges = corners[:, [1, 2, 3 if corners.shape[1] == 4 else 4]] - corners[:, :1]
-    mirrored = nodes[:, MIRRORED[nodes.shape[1]]]
+    if corners.shape[1] == 4:
+        mirrored = nodes[:, [0, 2, 1, 3]]
+    else:  # a tensor product, one layer after the other
+        layers = round(nodes.shape[1] ** (1.0 / 3.0))
+        mirrored = nodes.reshape(len(nodes), layers, -1)[:, ::-1].reshape(nodes.shape)
     return np.where((np.linalg.det(edges) < 0.0)[:, None], mirrored, nodes)
 
 
@@ -259,12 +259,17 @@ def _outwards(points: np.ndarray, triangles: np.ndarray, within: np.ndarray) -> 
     return Surface(points, np.where(turned[:, None], triangles[:, ::-1], triangles))
 
 
+def edges_of(faces: np.ndarray) -> np.ndarray:
+    """Return both nodes (n k, 2) of the edges around faces of nodes (n, k), face by face."""
+    return np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+
+
 def neighbours(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the edges that two faces of nodes (n, 3 or 4) share, and these faces (k, 2).
 
     Edges are (k, 2, 2): both nodes as either face runs along them.
     """
-    edges = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2)
+    edges = edges_of(faces)
     key = np.sort(edges, axis=1) @ [faces.max(initial=0) + 1, 1]
     order = np.argsort(key, kind="stable")
     pair = order[np.flatnonzero(np.diff(key[order]) == 0)[:, None] + [0, 1]]
@@ -382,9 +387,9 @@ def crossings(surface: Surface) -> np.ndarray:
     touches, as pieces of material that meet in a point.
     """
     corners, triangles = surface.corners, surface.triangles
-    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    edges = edges_of(triangles)
     _, first = np.unique(np.sort(edges, axis=1), axis=0, return_index=True)
-    edges, owners = edges[first], first % len(triangles)
+    edges, owners = edges[first], first // 3
     start, end = surface.points[edges].swapaxes(0, 1)
     centres = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
@@ -405,7 +410,7 @@ def crossings(surface: Surface) -> np.ndarray:
 def open_edges(surface: Surface) -> np.ndarray:
     """Return edges (n, 2) that no other triangle runs along in the opposite direction, but one."""
     triangles, count = surface.triangles, len(surface.points)
-    edges = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
+    edges = edges_of(triangles)
     there, back = (edges @ row for row in ([count, 1], [1, count]))
     _, which, times = np.unique(there, return_inverse=True, return_counts=True)
     return edges[~np.isin(back, there) | (times[which] > 1)]
