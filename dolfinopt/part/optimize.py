@@ -22,7 +22,7 @@ from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Curves, Meshes, mesh_parts
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
-from dolfinopt.part.plane.limits import limits_of_part
+from dolfinopt.part.plane.limits import limits_of_part, with_radii
 from dolfinopt.part.plane.part import PlanePart, make_part
 from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import PRICE, Search
@@ -229,13 +229,13 @@ def _free(scene: Scene, k: int, part: Part, more: float = 1.0) -> FreeSides:
             "is what dolfinopt optimize has made of it; leave --optimize out, or make a plate of "
             "it (arms.extruded = true)"
         )
-    limits = limits_of_part(
-        flat.domain, flat.outline.tool_radius, scene.design.minimum_gap, min([1.0, *sizes])
-    )
+    smallest, tool = min([1.0, *sizes]), flat.outline.tool_radius
+    limits = limits_of_part(flat.domain, tool, scene.design.minimum_gap, smallest)
     if more > 1.0:
-        curves = Curves(flat.outline.tool_radius)
-        flat = replace(make_part(flat.domain, curves, more), tolerance=flat.tolerance)
-    free = FreeSides(flat, flat.sides, limits, part.domain if isinstance(part, SolidPart) else None)
+        flat = replace(make_part(flat.domain, Curves(tool), more), tolerance=flat.tolerance)
+    # Radii are the same in all sizes: smaller ones leave room on the sides of the smallest.
+    sides = with_radii(flat.sides, lambda radius: max(tool, smallest * radius))
+    free = FreeSides(flat, sides, limits, part.domain if isinstance(part, SolidPart) else None)
     result = free.nearest()
     return free if result is None else result[0]
 

@@ -569,8 +569,7 @@ def looped(
             continue
         half = _half(turn)
         ends = (places[k - 1], places[(k + 1) % len(places)])
-        # Less than half of a side: an arm that has the design at three quarters of the size, too.
-        room = 0.35 * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
+        room = 0.5 * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
         radius = max(min(radius_at(b, place, half), room), limits.tool, SHORT * limits.cell)
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
         near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)

@@ -8,7 +8,7 @@ steps, each the shortest x with A x <= -g.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -247,19 +247,25 @@ def rounded_radii(sides: Sides, limits: Limits) -> Sides:
         steps = round(radius / HALF), np.ceil(limits.tool / HALF - 1e-9), 1
         return float(HALF * max(steps))
 
+    even = with_radii(sides, rounded)
+    circles = tuple(replace(circle, radius=rounded(circle.radius)) for circle in sides.circles)
+    even = replace(even, circles=circles, holds_radii=True)
+    result = limits.nearest(even, area=sides.shape.area) or limits.nearest(even)
+    return sides if result is None else replace(result[0], holds_radii=False)
+
+
+def with_radii(sides: Sides, of: Callable[[float], float]) -> Sides:
+    """Return sides whose fillets have other radii, m."""
     loops = tuple(
         replace(
             loop,
             corners=tuple(
-                replace(c, radius=rounded(c.radius)) if c.radius > 0.0 else c for c in loop.corners
+                replace(c, radius=of(c.radius)) if c.radius > 0.0 else c for c in loop.corners
             ),
         )
         for loop in sides.loops
     )
-    circles = tuple(replace(circle, radius=rounded(circle.radius)) for circle in sides.circles)
-    even = replace(sides, loops=loops, circles=circles, holds_radii=True)
-    result = limits.nearest(even, area=sides.shape.area) or limits.nearest(even)
-    return sides if result is None else replace(result[0], holds_radii=False)
+    return replace(sides, loops=loops)
 
 
 # -- places of the outline that face each other --------------------------------------------------
