@@ -12,7 +12,7 @@ import numpy as np
 from dolfinopt.arms.arm import Patterns, PhysicalDesign
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.collocation import Solution
-from dolfinopt.optimization.problem import EvaluatedDesign, needs_gradient, variants_of
+from dolfinopt.optimization.problem import EvaluatedDesign, binds, variants_of
 from dolfinopt.optimization.projection import Projection
 from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, together
@@ -160,7 +160,7 @@ class Evaluator:
         if self.trajectory is not None:
             self.solutions = self.trajectory.solutions
         variant = variants_of(self.scene)[-1] if variant is None else variant
-        asked = partial(needs_gradient, self.scene, variant)
+        asked = partial(binds, self.scene, variant)
         rows = constraint_gradients(*self._analysed, evaluation.responses, asked=asked)
         by_cells = [gradient(*self._analysed), *(row.smooth for row in rows)]
         by_x, limits = self._by_variables(design, by_cells), np.array([row.limit for row in rows])

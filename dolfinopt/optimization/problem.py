@@ -103,28 +103,22 @@ def variants_of(scene: Scene) -> list[int]:
     return [0, 2] if spared else [0, 1, 2]
 
 
-def needs_gradient(scene: Scene, variant: int, response: str) -> bool:
-    """Return whether the gradient of a limited response counts of one of `variants_of`.
-
-    That of the volume counts of the nominal one, or of the dilated one in its place.
-    """
-    of_nominal = find(response).declared.of_nominal
-    if variant == 1 and of_nominal:
-        return scene.design.controls_widths
-    return variant == variants_of(scene)[-1] or (not of_nominal and binds(scene, variant, response))
-
-
 def binds(scene: Scene, variant: int, response: str) -> bool:
-    """Return whether the limit of a response is kept by that one of robust designs, too.
+    """Return whether the limit of a response, and so its gradient, counts of one of `variants_of`.
 
-    Where limits are the nominal one's the eroded one keeps them, but for what depends on the phase
-    of a vibration and so pulls either at random: with a limit on settling alone there is no other.
-    `scara.toml` ends at 0.513 kg, with that row of the eroded one at 0.531 to 0.543.
+    Where limits are the nominal one's the eroded one keeps them, too, but for what depends on the
+    phase of a vibration and so pulls either at random: with a limit on settling alone there is no
+    other. `scara.toml` ends at 0.512 kg, with that row of the eroded one at 0.531 to 0.543. That of
+    the volume is the nominal one's, with the gradient of the dilated one where members have widths.
     """
-    declared = [limited_by(key) for key in scene.limits]
-    others = [item for item in declared if not (item.of_nominal or item.of_phase)]
-    spared = find(response).declared.of_phase and others
-    return not scene.design.limits_nominal or (variant == 0 and not spared)
+    design, declared = scene.design, find(response).declared
+    if variant == variants_of(scene)[-1]:
+        return True
+    if declared.of_nominal:
+        return variant == 1 and design.controls_widths
+    limited = [limited_by(key) for key in scene.limits]
+    others = [item for item in limited if not (item.of_nominal or item.of_phase)]
+    return not design.limits_nominal or (variant == 0 and not (declared.of_phase and others))
 
 
 def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndarray, ...]:
@@ -175,9 +169,8 @@ def problem_of(
     own = np.array([find(name).declared.of_nominal for name in limited], dtype=bool)
     kept = [
         ~own & np.array([binds(scene, variant, name) for name in limited], dtype=bool)
-        for variant in variants_of(scene)[: len(designs) - 1]
+        for variant in variants_of(scene)
     ]
-    kept.append(~own)
     dfdx = np.empty((0, 0))
     if nominal.differentiated:
         by_nominal = nominal.constraints[own]
