@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
 NAME = CHECKPOINT
+SEAL = "digest"  # of all other arrays
 # Fields that the file has as JSON, which keeps every bit of a number: of `Memory`, and of its best
 # design; of a solution those that are arrays.
 PLAIN = (
@@ -51,7 +53,7 @@ def _scene_text(scene: Scene) -> str:
 def begin(folder: Path, scene: Scene) -> None:
     """Write the checkpoint of a run that has done nothing yet, and nothing else (root only)."""
     remove_stale(folder)
-    write_arrays(folder / NAME, _stamp(scene))
+    _sealed(folder, _stamp(scene))
 
 
 def _stamp(scene: Scene) -> dict[str, np.ndarray]:
@@ -75,7 +77,22 @@ def save(
     arrays = _of_arms(partition, arms, memory, len(scene.arms) + 1)
     with together(partition.world):
         if partition.world.rank == 0:
-            write_arrays(folder / NAME, {**_stamp(scene), **arrays, **_of_run(memory)})
+            _sealed(folder, {**_stamp(scene), **arrays, **_of_run(memory)})
+
+
+def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write the checkpoint with a digest, so that a changed one is known."""
+    write_arrays(folder / NAME, {**arrays, SEAL: np.array(_digest(arrays))})
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return what stands for names, types, shapes and values of arrays."""
+    result = hashlib.blake2b(digest_size=16)
+    for key in sorted(arrays):
+        array = arrays[key]
+        result.update(f"{key} {array.dtype.str} {array.shape}".encode())
+        result.update(array.tobytes())
+    return result.hexdigest()
 
 
 def check(folder: Path, scene: Scene) -> None:
@@ -110,7 +127,9 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
         )
     try:
         with np.load(path, allow_pickle=False) as data:
-            arrays = {key: data[key] for key in data.files}  # it knows changed bytes
+            arrays = {key: data[key] for key in data.files}
+        if str(arrays.pop(SEAL)) != _digest(arrays):
+            raise ValueError("it was changed")
         theirs = json.loads(str(arrays["scene"]))
     except Exception as error:  # whatever a foreign or damaged file may raise
         raise InputError(

@@ -72,8 +72,8 @@ def test_buckling_of_the_part_stands_in_the_table(made):
     row = check.table().loc["buckling"]
     assert row["unit"] == "-" and np.isnan(row["density"]) and np.isnan(row["crisp"])
     assert row["part"] == check.part.buckling.factor > checks.SAFE
-    # 197.7 on 1266 triangles, 196.2 on 3947, 196.1 on 13657.
-    assert row["part"] == pytest.approx(196.1, rel=5e-3)
+    # 199.2 on 2854 even triangles, 197.8 on 4055, 197.7 on 10939.
+    assert row["part"] == pytest.approx(197.7, rel=5e-3)
     values = check.to_dict()["table"]["buckling"]
     assert values == {"unit": "-", "density": None, "crisp": None, "part": row["part"]}
     assert not any("buckles" in text for text in check.warnings)
