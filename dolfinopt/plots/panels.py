@@ -136,7 +136,7 @@ def panel_figure(
             labels = [line.label for line in panel.lines if line.label not in ("", panel.title)]
             if labels:
                 shown = axes.lines[: len(labels)]
-                below = 0.0, -0.5 / span[1]
+                below = 0.0, -0.49 / span[1]
                 axes.legend(shown, map(shortened, labels), **LEGEND, bbox_to_anchor=below)
         top -= legend
     return figure
