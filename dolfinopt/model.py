@@ -435,7 +435,7 @@ class Model:
         place = self.scene, partition, arms
         evaluation, trajectory = evaluate(*place, x_phys, self._profile, simulated=False)
         rows = constraint_gradients(*place, trajectory, self._profile, evaluation.responses)
-        by_cells = [gradient(*place, trajectory, self._profile), *(row.cells for row in rows)]
+        by_cells = [gradient(*place, trajectory, self._profile), *rows]
         zero = {k: np.zeros_like(x_phys[k]) for k in arms}
         names = ["objective", *(limit.name for limit in limits_of(self.scene, evaluation))]
         values = [evaluation.objective, *evaluation.constraints]

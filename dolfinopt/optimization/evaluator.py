@@ -162,9 +162,8 @@ class Evaluator:
         variant = variants_of(self.scene)[-1] if variant is None else variant
         asked = partial(binds, self.scene, variant)
         rows = constraint_gradients(*self._analysed, evaluation.responses, asked=asked)
-        by_cells = [gradient(*self._analysed), *(row.smooth for row in rows)]
-        by_x, limits = self._by_variables(design, by_cells), np.array([row.limit for row in rows])
-        return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:] / limits[:, None])
+        by_x = self._by_variables(design, [gradient(*self._analysed), *rows])
+        return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:])
 
     def objective_gradient(self, design: Mapping[int, PhysicalDesign]) -> np.ndarray:
         """Return the objective's gradient (n,) by x of the design evaluated last (collective)."""

@@ -13,7 +13,6 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,
-    GREY_SHARE,
     LEAST_REACH,
     NEWTON_ITERATIONS,
     REACH_GROWTH,
@@ -117,15 +116,8 @@ class Iterate:
         """Go on with the designs that x stands for (collective)."""
         self._set(designs)
         self.progress = self.progress.after(self.problem.values[0], self.problem.excess)
-        projected = bool(self.scene.design.projection)
-        new = Best(
-            self.x.copy(),
-            self.iteration,
-            self.projection.beta,
-            float(self.problem.values[0]),
-            self.problem.excess,
-            crisp=projected and self._volumes()[2] <= GREY_SHARE,
-        )
+        value, excess = float(self.problem.values[0]), self.problem.excess
+        new = Best(self.x.copy(), self.iteration, self.projection.beta, value, excess)
         if new.rank < self.best.rank:
             self.best = new
 
@@ -144,7 +136,7 @@ class Iterate:
         rises = self.projection.rises(self.problem.excess)
         shorter = 1.0
         for _ in range(STEP_ATTEMPTS):
-            new, after = self._proposed(shorter * self.reach * self.projection.move)
+            new, after = self._proposed(shorter * self.reach * self.scene.optimizer.move)
             if rises:
                 self.projection.advance()
             designs = self._tried(new)

@@ -38,8 +38,6 @@ DEPENDENT_SHARE = 1e-12
 ROOM_SHARE = 1e-3  # of their range that variables are away from both bounds that can move
 # Of the range, step of the variable that moves most: what bounds nearer than that hold.
 TRIAL_STEP_SHARE = 0.1
-# Grayness above which a projection has not done its work: 2 % of the cells at 1/2.
-GREY_SHARE = 0.02
 WINDOW = 20  # iterations in which a run that goes on gains `optimizer.tolerance`; 10 end rods early
 # Of the best design in half a window, with which frozen loads go on; with less the exact gradient.
 FROZEN_GAIN = 0.01

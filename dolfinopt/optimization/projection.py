@@ -28,12 +28,6 @@ class Projection:
         return not design.projection or self.beta >= design.sharpness
 
     @property
-    def move(self) -> float:
-        """Move limit, shorter where the projection is steep and x_phys would leap."""
-        slope = 0.5 * self.beta  # x_phys moves by that times what x does; where x_phys is 1/2
-        return self.scene.optimizer.move * min(1.0, (2.0 / slope) ** 0.5)
-
-    @property
     def least_reach(self) -> float:
         """Least factor on the move limit while beta rises: x can follow it."""
         return LEAST_REACH * (SLOW_CONTINUATION / self.scene.design.continuation) ** 1.5

@@ -82,10 +82,7 @@ class HistoryRow:
 
 @dataclass(frozen=True, eq=False)
 class Best:
-    """The best design so far, among those that keep all limits; crisp ones before grey ones.
-
-    Of grey ones that of the sharpest projection counts: a projection that becomes steeper may lose
-    a design that was crisp already.
+    """The best design so far, among those that keep all limits with the sharpest projection.
 
     Attributes:
         x: (n,) this rank's variables.
@@ -93,7 +90,6 @@ class Best:
         beta: steepness of the projection.
         objective: what is minimised.
         excess: largest relative violation of a limit.
-        crisp: whether nearly all of it is solid or void.
     """
 
     x: np.ndarray
@@ -101,7 +97,6 @@ class Best:
     beta: float
     objective: float
     excess: float
-    crisp: bool = False
 
     @classmethod
     def none(cls, x: np.ndarray) -> Best:
@@ -113,7 +108,7 @@ class Best:
         """What is smaller for a better design; of infeasible ones the least violation counts."""
         if self.excess > 0.0:
             return True, self.excess, self.objective
-        return False, -np.inf if self.crisp else -self.beta, self.objective
+        return False, -self.beta, self.objective
 
 
 @dataclass(frozen=True)

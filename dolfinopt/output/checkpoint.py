@@ -34,7 +34,7 @@ SEAL = "digest"  # of all other arrays
 PLAIN = (
     "iteration", "change", "reach", "mma_steps", "gradient", "beta", "exact_from",
 )  # fmt: skip
-BEST = "iteration", "beta", "objective", "excess", "crisp"
+BEST = "iteration", "beta", "objective", "excess"
 SOLUTION = "time_grid", "nodes", "q", "qd", "a"
 # Keys a resumed run may change: when to stop, and how to go on from where it is.
 MAY_CHANGE = {

@@ -277,7 +277,7 @@ class Problem:
         result = constraint_gradients(*given, measured=simulated.evaluation.responses, by=by_nodes)
         for limit, row in zip(every, result, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
-                rows.append({k: self._factor(limit) * g for k, g in row.cells.items()})
+                rows.append({k: self._factor(limit) * g for k, g in row.items()})
         return np.vstack([self._by_x(state, rows), self._volumes(state.outlines)[1]])
 
     def _by_x(self, state: State, rows: list[dict[int, np.ndarray]]) -> np.ndarray:

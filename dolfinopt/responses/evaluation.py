@@ -27,11 +27,11 @@ from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
     Measured,
-    Response,
     bodies_in,
     constraints_of,
     needs,
     objective_of,
+    sums,
 )
 from dolfinopt.scene.load import Scene, pose_scenarios
 
@@ -182,33 +182,7 @@ def gradient(
     """
     analysis = analysis_of(scene, partition, arms, trajectory, profile, by)
     rows = objective_of(scene).gradients(analysis)
-    if len(rows) == 1:
-        return rows[0]
-    owners = {k for row in rows for k in row}
-    return {k: np.sum([row[k] for row in rows if k in row], axis=0) for k in owners}
-
-
-@dataclass(frozen=True, eq=False)
-class ConstraintGradient:
-    """One entry of `Evaluation.constraints`, smooth value / smooth limit - 1, differentiated.
-
-    The limit is held: its scale follows the design, see `response`.
-
-    Attributes:
-        response: whose value it is.
-        smooth: derivative of the smooth value by the physical densities (n_cells,) of every arm
-            that it depends on, or by other variables of the designs.
-        limit: in the unit of the smooth value.
-    """
-
-    response: Response
-    smooth: CellGradient
-    limit: float
-
-    @property
-    def cells(self) -> CellGradient:
-        """Derivative of the constraint by the physical densities of every arm."""
-        return {k: g / self.limit for k, g in self.smooth.items()}
+    return sums(item for row in rows for item in row.items())
 
 
 def constraint_gradients(
@@ -220,8 +194,10 @@ def constraint_gradients(
     measured: Sequence[Measured] = (),
     by: By = by_design,
     asked: Callable[[str], bool] = lambda _: True,
-) -> list[ConstraintGradient]:
+) -> list[CellGradient]:
     """Return the gradients of `Evaluation.constraints` (collective).
+
+    Smooth value / smooth limit - 1, the limit held: its scale follows the design, see `response`.
 
     Args:
         scene, partition, arms, trajectory, profile: as for `gradient`; the last two are for
@@ -231,17 +207,15 @@ def constraint_gradients(
         asked: whether the gradient of a response, by its name, is of any use; else it is left out.
     """
     analysis = analysis_of(scene, partition, arms, trajectory, profile or Profile(), by)
-    result = []
+    result = list[CellGradient]()
     for k, bound in enumerate(constraints_of(scene), 1):
         values = measured[k] if measured else bound.response.measure(analysis)
         limits = bound.smooth_limits(values)
         rows: list[CellGradient] = [{} for _ in limits]
         if asked(bound.response.name):
             rows = bound.response.gradients(analysis)
-        result += [
-            ConstraintGradient(bound.response, row, float(limit))
-            for row, limit in zip(rows, limits, strict=True)
-        ]
+        for row, limit in zip(rows, limits, strict=True):
+            result.append({k: g / limit for k, g in row.items()})
     return result
 
 

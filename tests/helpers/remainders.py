@@ -48,7 +48,9 @@ class Built:
     def constraint_gradients(self, trajectory=None) -> list[dict[int, np.ndarray]]:
         """Return the gradients of `beside_volume` at the design evaluated last."""
         rows = constraint_gradients(*self.place, trajectory, self.profile)
-        return [row.cells for row in rows if row.response.name != "volume_fraction"]
+        design, count = self.scene.design, len(self.scene.designed)
+        volumes = 1 if design.shared_volume else count
+        return rows if design.volume_fraction is None else rows[volumes:]
 
     def dot(self, a: Cells, b: Cells) -> float:
         """Return the product over all cells of all arms, on all ranks."""

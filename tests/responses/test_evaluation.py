@@ -228,7 +228,7 @@ def seen(scene_file, *overrides):
     evaluation, trajectory = built.evaluate({k: a.uniform(0.5) for k, a in built.arms.items()})
     place = built.scene, built.partition, built.arms
     rows = [built.gradient(trajectory)]
-    rows += [one.cells for one in constraint_gradients(*place, trajectory, built.profile)]
+    rows += constraint_gradients(*place, trajectory, built.profile)
     return evaluation, rows, trajectory
 
 

@@ -129,18 +129,19 @@ class Limits:
     # -- widths of members and gaps ---------------------------------------------------------------
 
     def _widths(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
+        """Yield the rows of the narrowest place between two pieces, and of the one farthest off."""
         result = facing(sides, self.cell, NEAR * max(self.member, self.gap))
+        width = result.width
         for members, least in ((True, self.member), (False, self.gap)):
-            near = np.flatnonzero((result.members == members) & (result.width < NEAR * least))
-            key = np.sort(result.pairs[near], axis=1)
-            _, group = np.unique(key, axis=0, return_inverse=True)
-            for item in range(group.max(initial=-1) + 1):
-                here = near[group.ravel() == item]
-                low = here[np.argmin(result.width[here])]
-                same = here[result.pairs[here, 0] == result.pairs[low, 0]]
-                far = same[np.argmax(np.abs(result.t[same, 0] - result.t[low, 0]))]
-                for k in {low, far}:
-                    yield least - result.width[k], result.by_q(k, sides.numbers[0])
+            near = np.flatnonzero((result.members == members) & (width < NEAR * least))
+            pairs, t = result.pairs[near], result.t[near, 0]
+            group = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)[1].ravel()
+            narrow = _least_of_each(group, width[near])
+            low = narrow[group]
+            same = pairs[:, 0] == pairs[low, 0]
+            far = _least_of_each(group, np.where(same, -np.abs(t - t[low]), 0.0))
+            chosen = near[np.union1d(narrow, far)]
+            yield from zip(least - width[chosen], result.by_q(chosen, sides.numbers[0]))
 
     # -- where material may be and must be --------------------------------------------------------
 
@@ -294,13 +295,23 @@ class Facing:
         """(k,) m."""
         return np.linalg.norm(self.across, axis=1)
 
-    def by_q(self, k: int, count: int) -> np.ndarray:
-        """Return the derivative (count,) by q of the width of pair k, less its sign."""
-        result, u = np.zeros(count), self.across[k] / self.width[k]
-        for which, t, g in zip(self.pairs[k], self.t[k], (u, -u), strict=True):
-            if self.every[which].moves is not None:
-                result = result + self.every[which].pull(np.array([t]), g[None, None])[0]
+    def by_q(self, chosen: np.ndarray, count: int) -> np.ndarray:
+        """Return the derivatives (k, count) by q of the widths of k pairs, less their signs."""
+        result, u = np.zeros((len(chosen), count)), self.across / self.width[:, None]
+        for which, sign in enumerate((1.0, -1.0)):
+            pieces = self.pairs[chosen, which]
+            for piece in np.unique(pieces):
+                rows = np.flatnonzero(pieces == piece)
+                if self.every[piece].moves is not None:
+                    g = sign * np.eye(len(rows))[:, :, None] * u[chosen[rows]]
+                    result[rows] += self.every[piece].pull(self.t[chosen[rows], which], g)
         return result
+
+
+def _least_of_each(group: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return where the least value (n,) of each group stands; groups are numbered (n,) from 0."""
+    order = np.lexsort((value, group))
+    return order[np.unique(group[order], return_index=True)[1]]
 
 
 def facing(sides: Sides, cell: float, most: float) -> Facing:
@@ -316,7 +327,8 @@ def facing(sides: Sides, cell: float, most: float) -> Facing:
     number, _, at = _samples(every, cell)
     pairs = cKDTree(at).query_pairs(most + cell, output_type="ndarray")
     pairs = np.vstack([pairs, pairs[:, ::-1]])
-    place, other = np.unique(np.stack([pairs[:, 0], number[pairs[:, 1]]]), axis=1)
+    both = np.unique(pairs[:, 0] * len(every) + number[pairs[:, 1]])
+    place, other = np.divmod(both, len(every))
     apart = ~_together(every, sides)[number[place], other]
     place, other = place[apart], other[apart]
     own, curves = number[place], np.array([_as_numbers(item.piece.curve) for item in every])

@@ -62,7 +62,7 @@ class Design(Table):
         'designs together); limits hold for the nominal one, as it is meant, with "robust-eroded" '
         "for every one of them [-]",
     )
-    sharpness: float = setting(128.0, "final beta of the projection [-]", ge=1, le=1e4)
+    sharpness: float = setting(16.0, "final beta of the projection [-]", ge=1, le=1e4)
     continuation: int = setting(
         25, "number of iterations after which beta doubles [-]", ge=1, le=MAX_ITERATIONS
     )
