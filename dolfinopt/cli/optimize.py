@@ -112,7 +112,8 @@ def _tell_ahead(world: MPI.Comm, scene: Scene) -> None:
     from dolfinopt.study.sections import ahead
 
     with TemporaryDirectory() as own:
-        lines = ahead(scene, Runner(Path(world.bcast(own, root=0)), world, shown=False))
+        folder = Path(world.bcast(own, root=0))
+        lines = Runner(folder, world, shown=False).follow(ahead(scene, folder))
         with together(world):  # until all ranks are done with the folder
             for line in lines:
                 click.echo(line)

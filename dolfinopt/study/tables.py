@@ -109,8 +109,8 @@ class Study:
     name: str  # of its files
     tables: tuple[Table, ...]  # the main one first
     figures: tuple[Figure, ...]
-    failures: tuple[str, ...]  # one line each
-    computed: int  # cases that were not there before
+    failures: tuple[str, ...] = ()  # one line each
+    computed: int = 0  # cases that were not there before
 
     def markdown(self) -> str:
         """Return all tables but the long ones."""

@@ -20,20 +20,19 @@ from scipy import stats
 from scipy.stats import qmc
 
 from dolfinopt.errors import InputError
-from dolfinopt.parallel import on_root
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import allowed_words, field_at
 from dolfinopt.scene.old_words import in_new_words
 from dolfinopt.scene.tables.base import without_none
-from dolfinopt.study.cases import SAMPLED, Case, Runner, scales_bodies, with_sample
+from dolfinopt.study.cases import SAMPLED, Case, Steps, scales_bodies, with_sample
 from dolfinopt.study.studies import (
     QUANTITIES,
     Design,
-    Plan,
     Report,
+    Rows,
     by_design,
-    carry_out,
     given_designs,
+    reported,
 )
 from dolfinopt.study.tables import Figure, FrameFigure, Study, Table, file_name
 from dolfinopt.study.variants import asked_by, axis_of, changed
@@ -343,37 +342,20 @@ def study_random(
     scene: Scene,
     random: Sequence[str],
     designs: Sequence[Path],
-    runner: Runner,
     samples: int = 1000,
     seed: int = 1,
-) -> Study:
-    """Simulate designs under random values of the scene (collective).
+) -> Steps[Study]:
+    """Return the steps of simulating designs under random values of the scene.
 
     Args:
         scene: with the nominal values; its scenarios are left out.
         random: texts "key.path=distribution", see `parse_distribution`.
-        designs, runner: see `studies.study`; InputError as there.
+        designs: see `studies.study`; InputError as there.
         samples: how many.
         seed: of what is random.
     """
-    plan = on_root(runner.world, _plan, scene, random, designs, samples, seed)
-    return carry_out(plan, runner)
-
-
-def random_name(random: Sequence[str]) -> str:
-    """Return the name of the files of a study: the keys that are random."""
-    return file_name("uncertainty", *(text.partition("=")[0].strip() for text in random))
-
-
-# -- what is asked ---------------------------------------------------------------------------
-
-
-def _plan(
-    scene: Scene, random: Sequence[str], designs: Sequence[Path], count: int, seed: int
-) -> Plan:
-    """Check what is asked and draw the samples (root only)."""
-    if count < LEAST:
-        raise InputError(f"--samples {count}: expected at least {LEAST}")
+    if samples < LEAST:
+        raise InputError(f"--samples {samples}: expected at least {LEAST}")
     if seed < 0:
         raise InputError(f"--seed {seed}: expected an integer >= 0")
     nominal = changed(scene, "scenarios=[]") if scene.scenarios else scene
@@ -381,16 +363,22 @@ def _plan(
     keys = [item.key for item in inputs]
     if twice := [key for key in keys if keys.count(key) > 1]:
         raise InputError(f"--random {twice[0]} twice; a value has one distribution")
-    values = draw([item.distribution for item in inputs], unit_points(count, len(inputs), seed))
-    samples = sample_texts(keys, values)
+    values = draw([item.distribution for item in inputs], unit_points(samples, len(inputs), seed))
+    texts = sample_texts(keys, values)
     for index in (*values.argmin(axis=0), *values.argmax(axis=0)):  # refused, it is so there mostly
-        with_sample(nominal, samples[1 + index], 1 + index)
-    rows = [
+        with_sample(nominal, texts[1 + index], 1 + index)
+    rows: Rows = [
         ({"design": label}, case)
         for label, design in given_designs(scene, designs).items()
-        for case in sample_cases(nominal, samples, label, design)
+        for case in sample_cases(nominal, texts, label, design)
     ]
-    return Plan(random_name(random), rows, partial(_report, inputs=inputs, values=values))
+    report = partial(_report, inputs=inputs, values=values)
+    return (yield from reported(random_name(random), rows, report))
+
+
+def random_name(random: Sequence[str]) -> str:
+    """Return the name of the files of a study: the keys that are random."""
+    return file_name("uncertainty", *(text.partition("=")[0].strip() for text in random))
 
 
 def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...]]:
