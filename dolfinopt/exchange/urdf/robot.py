@@ -96,6 +96,11 @@ class Inertia:
     centre: np.ndarray
     tensor: np.ndarray
 
+    @property
+    def moments(self) -> np.ndarray:
+        """Components xx, yy, zz, xy, xz, yz of the tensor (6,), kg m2."""
+        return self.tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+
     def posed(self, pose: np.ndarray) -> Inertia:
         """Return it in the components of the outer frame of `pose`."""
         R = pose[:3, :3]
@@ -217,7 +222,7 @@ def inverse(pose: np.ndarray) -> np.ndarray:
 
 
 def roll_pitch_yaw_of(R: np.ndarray) -> tuple[float, float, float]:
-    """Return URDF's fixed-axis roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll).
+    """Return URDF's fixed-axis roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll), or of a pose.
 
     Roll and pitch are taken from Rz(-yaw) R, so that R comes back to rounding for any yaw, also
     where a pitch of a quarter turn leaves yaw to chance.
@@ -494,7 +499,7 @@ class RobotLoops:
 
     Attributes:
         passive: names of the joints that follow, in the robot.
-        closures: keys and values of every closure; `between` names links.
+        closures: keys and values of every closure; `between`, links and what follows their names.
         interfaces: of bodies by their link, (name, point in the body's frame).
         rods: names of those rods whose length is a column of the table.
     """
@@ -582,9 +587,9 @@ class _Reader:
         keys["point"] = second[:3, 3].tolist()
         if table["kind"] != "rod":
             keys["rpy"] = self._turned(key, table.get("rpy", [0.0] * 3), second[:3, :3])
-        keys["between"], interface = [body, other], None
+        keys["between"], interface = [(body, ""), (other, "")], None
         if not self.bodies[body].is_solid and np.linalg.norm(first[:3, 3]) > SAME_PLACE:
-            keys["between"][0], interface = f"{body}.{table['name']}", (body, first[:3, 3])
+            keys["between"][0], interface = (body, f".{table['name']}"), (body, first[:3, 3])
         return keys, interface
 
     def _turned(self, key: str, rpy: Any, R: np.ndarray) -> list[float]:
