@@ -126,10 +126,10 @@ def _conclude(
     from dolfinopt.cli.report import conclude
     from dolfinopt.output.run_folder import write_result
 
-    def pictures(views: list[ArmView]) -> None:
+    def pictures(place: Path, views: list[ArmView]) -> None:
         assert result.trajectory is not None
         history, initial = result.rows, result.initial_deviation
-        draw(folder, result.scene, views, result.trajectory, history, initial, animation=animation)
+        draw(place, result.scene, views, result.trajectory, history, initial, animation=animation)
 
     drawn = pictures if plots or animation else None
     written = write_result(folder, result, elapsed(), pictures=drawn)
