@@ -150,7 +150,7 @@ def _finer_deviation(scene: Scene, place: Place) -> float | None:
 def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
     """Write the joints of a scene's shaped motion as a table; return the scene that follows it."""
     motion = desired_motion(scene)
-    joints = np.arange(scene.num_rigid)[scene.driven_columns]
+    joints = scene.driven_columns
     end = scene.motion.duration + shaper.longer
     t = np.linspace(0.0, end, ROWS)
     shaped = shaper.shaped(lambda t: motion(t).q[:, joints], t)

@@ -454,7 +454,6 @@ def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     by = 1.0 if weights is None else np.array(weights)
     table = frame.rename(columns={"label": "objective"}).assign(
         **{"effort [-]": [float(np.linalg.norm(force * by)) for force in forces]},
-        **{"mass [kg]": [sum(item.get("mass", none).values()) for item in result]},
     )
     columns = ["objective", *QUANTITIES, "at [s]", "settling [mm]", "stress [MPa]", "effort [-]",
                "mass [kg]", "grayness [-]", "iterations", "seconds", "ended by"]  # fmt: skip

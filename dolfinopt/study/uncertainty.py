@@ -9,21 +9,18 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import combinations_with_replacement
 from pathlib import Path
-from types import UnionType
-from typing import Any, NamedTuple, Union, get_args, get_origin
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.polynomial import legendre
-from pydantic.fields import FieldInfo
 from scipy import stats
 from scipy.stats import qmc
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.messages import allowed_words, field_at
+from dolfinopt.scene.messages import allowed_words, field_at, model_at
 from dolfinopt.scene.old_words import in_new_words
-from dolfinopt.scene.tables.base import without_none
 from dolfinopt.study.cases import SAMPLED, Case, Steps, scales_bodies, with_sample
 from dolfinopt.study.studies import (
     QUANTITIES,
@@ -422,11 +419,11 @@ def parse_input(scene: Scene, text: str) -> Input:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
         if parts[-1].endswith("*"):
             return Input(key, 1.0, distribution.within(0.0, math.inf))
-        field = field_at((parts[0], parts[-1]))
+        loc = parts[0], parts[-1]
         try:
-            return Input(key, nominal_value(scene, key), distribution.within(*_range(field)))
+            return Input(key, nominal_value(scene, key), distribution.within(*_range(*loc)))
         except InputError as error:
-            words = allowed_words(field)
+            words = allowed_words(field_at(loc))
             raise InputError(f"{error}; {'.'.join(parts)} is {words}") from None
 
 
@@ -448,18 +445,14 @@ def nominal_value(scene: Scene, key: str) -> object:
     return values.pop() if len(values) == 1 else None
 
 
-def _range(field: FieldInfo) -> tuple[float, float]:
+def _range(table: str, name: str) -> tuple[float, float]:
     """Return the least and the largest value of a key, also of one that may be left out."""
-    kind = without_none(field.annotation)
-    if get_origin(kind) in (Union, UnionType):  # of arrays, too: the range of a number
-        kind = get_args(kind)[0]
-    inner = get_args(kind)[1:]
-    rules = [*field.metadata, *(rule for item in inner for rule in getattr(item, "metadata", ()))]
-    lows, highs = (
-        [getattr(rule, name) for rule in rules for name in names if hasattr(rule, name)]
-        for names in (("gt", "ge"), ("lt", "le"))
-    )
-    return max(lows, default=-math.inf), min(highs, default=math.inf)
+    model = model_at((table,))
+    assert model is not None
+    schema = model.model_json_schema()["properties"][name]
+    kind = schema.get("anyOf", [schema])[0]  # of arrays, too: the range of a number
+    low = kind.get("minimum", kind.get("exclusiveMinimum", -math.inf))
+    return low, kind.get("maximum", kind.get("exclusiveMaximum", math.inf))
 
 
 # -- what comes out --------------------------------------------------------------------------

@@ -118,8 +118,7 @@ def test_what_needs_a_strength_or_one_modulus_is_refused():
 def test_a_misspelt_material_is_suggested():
     for name, near in (("aluminum 7075-T6", '"aluminium 7075-T6"'), ("Steel s355", '"steel S355"'),
                        ("42crmo4", '"steel 42CrMo4"'), ("pla", '"PLA printed"')):  # fmt: skip
-        message = refused(tree(name), "material = ", "did you mean", near)
-        assert "more)" not in message
+        refused(tree(name), "material = ", "did you mean", near)
         refused(tree("POM", material=name), "arms.1.material (arm2) = ", "did you mean", near)
 
 
