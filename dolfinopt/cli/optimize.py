@@ -95,10 +95,10 @@ def optimize(
                     report=lambda row: say(in_words(row, most)),
                     compared=True,
                 )
+            _conclude(folder, result, plots, animation, verbose)
         except KeyboardInterrupt:
             instead = " in place of --overwrite" if overwrite else ""
             raise KeyboardInterrupt(f"to go on, add --resume{instead}") from None
-        _conclude(folder, result, plots, animation, verbose)
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")
 
