@@ -1,6 +1,10 @@
-"""What comes with the package wherever it is installed: meshes, the paper's scene, its page."""
+"""What comes with the package wherever it is installed: meshes, scenes, templates of files."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 
 def mesh_folder() -> Path:
@@ -24,10 +28,21 @@ def template_folder() -> Path:
     return Path(__file__).parent / "scene" / "templates"
 
 
-def page_folders() -> tuple[Path, ...]:
-    """Return the folders of the templates of HTML pages: of all pages, and of report.html."""
+def filled(template: str, filters: Mapping[str, Callable[..., Any]], **content: Any) -> str:
+    """Return a page or a file from a template (Jinja); what it names must be given."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
     here = Path(__file__).parent
-    return here / "study" / "pages", here / "paper" / "pages"
+    folders = [here / room / "pages" for room in ("study", "paper", "exchange/urdf")]
+    templates = Environment(
+        loader=FileSystemLoader(folders),
+        autoescape=lambda name: str(name).endswith(".html"),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    templates.filters |= filters
+    return templates.get_template(template).render(**content)
 
 
 def benchmark_folder() -> Path:

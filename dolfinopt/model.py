@@ -659,7 +659,7 @@ class Model:
             InputError: something asked for is not possible.
         """
         from dolfinopt.study.cases import Runner  # with pandas: a third of the import's time
-        from dolfinopt.study.studies import study
+        from dolfinopt.study.studies import carry_out, study
 
         with self._folder(folder) as place:
             paths = [
@@ -667,8 +667,8 @@ class Model:
                 for k, design in enumerate(designs, 1)
             ]
             runner = Runner(place, self._world, shown)
-            result = study(self.scene, preset, vary, paths, runner, reoptimize=reoptimize)
-            frame: DataFrame = self._world.bcast(result.tables[0].frame, root=0)
+            steps = study(self.scene, preset, vary, paths, reoptimize=reoptimize)
+            frame: DataFrame = carry_out(steps, runner).tables[0].frame
         return frame
 
     # -- designs over the ranks ----------------------------------------------------------------

@@ -168,11 +168,11 @@ def _materials(pattern: str | None, infos: list[KeyInfo]) -> list[str]:
     return [head, *rows] if rows else []
 
 
-def _in_units(value: float | tuple[float, ...] | None, unit: float) -> str:
+def _in_units(value: float | list[float] | None, unit: float) -> str:
     """Return a value, or those of both directions, in a unit; "-" for none."""
     if value is None:
         return "-"
-    values = value if isinstance(value, tuple) else (value,)
+    values = value if isinstance(value, list) else [value]
     return "/".join(f"{item / unit:.4g}" for item in values)
 
 

@@ -95,10 +95,10 @@ def optimize(
                     report=lambda row: say(in_words(row, most)),
                     compared=True,
                 )
+            _conclude(folder, result, plots, animation, verbose)
         except KeyboardInterrupt:
             instead = " in place of --overwrite" if overwrite else ""
             raise KeyboardInterrupt(f"to go on, add --resume{instead}") from None
-        _conclude(folder, result, plots, animation, verbose)
     if result.violated:  # known to all ranks
         raise ConvergenceError(f"the design is not feasible: {result.violated}")
 
@@ -112,7 +112,8 @@ def _tell_ahead(world: MPI.Comm, scene: Scene) -> None:
     from dolfinopt.study.sections import ahead
 
     with TemporaryDirectory() as own:
-        lines = ahead(scene, Runner(Path(world.bcast(own, root=0)), world, shown=False))
+        folder = Path(world.bcast(own, root=0))
+        lines = Runner(folder, world, shown=False).follow(ahead(scene, folder))
         with together(world):  # until all ranks are done with the folder
             for line in lines:
                 click.echo(line)
@@ -125,10 +126,10 @@ def _conclude(
     from dolfinopt.cli.report import conclude
     from dolfinopt.output.run_folder import write_result
 
-    def pictures(views: list[ArmView]) -> None:
+    def pictures(place: Path, views: list[ArmView]) -> None:
         assert result.trajectory is not None
         history, initial = result.rows, result.initial_deviation
-        draw(folder, result.scene, views, result.trajectory, history, initial, animation=animation)
+        draw(place, result.scene, views, result.trajectory, history, initial, animation=animation)
 
     drawn = pictures if plots or animation else None
     written = write_result(folder, result, elapsed(), pictures=drawn)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.scene.load import Scene
+    from dolfinopt.study.cases import Steps
     from dolfinopt.study.tables import Study
 
 PRESETS = ("payload", "flattening", "coordinates")
@@ -49,9 +50,9 @@ designs_option = click.option(
 )
 
 
-# What a command asks: name of the study's files, design.npz files, what does the study, and what
-# else it asks, but for the values it goes through, which may grow.
-Question = tuple[str, Sequence[Path], Callable[..., "Study"], dict[str, Any]]
+# What a command asks: name of the study's files, design.npz files, the study's steps in a folder,
+# and what else it asks, but for the values it goes through, which may grow.
+Question = tuple[str, Sequence[Path], Callable[[Path], "Steps[Study]"], dict[str, Any]]
 
 
 def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
@@ -71,6 +72,7 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
         name, designs, study, question = ask(loaded, **own)
         from dolfinopt.parallel import on_root
         from dolfinopt.study.cases import Runner
+        from dolfinopt.study.studies import carry_out
         from dolfinopt.study.tables import write_study
 
         # One folder for all studies of a scene, which share the optimised design.
@@ -78,7 +80,7 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
         asked = on_root(world, _asked, loaded, designs) | question
         if not overwrite:
             on_root(world, _check_question, folder, name, asked)
-        done = study(runner=Runner(folder, world, keep=keep))
+        done = carry_out(study(folder), Runner(folder, world, keep=keep))
 
         def conclude() -> None:
             _remove_listed(folder, name)
@@ -175,8 +177,8 @@ def sweep(
     """
     from dolfinopt.study.studies import study, sweep_name
 
-    do = partial(study, scene, preset, vary, designs, reoptimize=reoptimize)
-    return sweep_name(preset, vary), designs, do, {}
+    name = sweep_name(preset, vary)
+    return name, designs, lambda _: study(scene, preset, vary, designs, reoptimize=reoptimize), {}
 
 
 @click.command()
@@ -227,7 +229,7 @@ def compare(
     vary = []
     if kinds and what == "reductions":
         vary, kinds = [f"reduction.coordinates={','.join(kinds)}"], ()
-    return preset, designs, partial(study, scene, preset, vary, designs, kinds=kinds), {}
+    return preset, designs, lambda _: study(scene, preset, vary, designs, kinds=kinds), {}
 
 
 @click.command()
@@ -254,8 +256,8 @@ def uncertainty(
     """
     from dolfinopt.study.uncertainty import random_name, study_random
 
-    do = partial(study_random, scene, random, designs, samples=samples, seed=seed)
-    return random_name(random), designs, do, {"distributions": sorted(random)}
+    name, asked = random_name(random), {"distributions": sorted(random)}
+    return name, designs, lambda _: study_random(scene, random, designs, samples, seed), asked
 
 
 @click.command()

@@ -144,7 +144,7 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
     seen, scene = trajectory.sampled, trajectory.scene
     if seen.feed_forward is None:
         return
-    joints = np.arange(scene.num_rigid)[scene.driven_columns]
+    joints = scene.driven_columns
     rate, drive = BESIDE_JOINTS
     columns = [seen.t, seen.commanded.q[:, joints], seen.commanded.qd[:, joints]]
     header = ["t", *scene.driven, *(f"{rate}{name}" for name in scene.driven)]

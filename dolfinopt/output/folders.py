@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import FULL, unwritten, working_in
+from dolfinopt.disk import FULL, make_folder, unwritten, working_in, writing
 from dolfinopt.errors import InputError
+from dolfinopt.interrupt import interrupted_later
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, named_files
 
@@ -47,6 +49,7 @@ RUN_FILES = (
 
 # The parts of a run's design, and the file there that lists them.
 PARTS, PARTS_LIST = "part", "part.json"
+WRITTEN = ".results"  # folder of results until all are written
 
 
 def prepare_folder(folder: Path) -> None:
@@ -146,6 +149,28 @@ def remove_stale(
             ) from None
 
 
+@contextmanager
+def written_together(folder: Path) -> Iterator[Path]:
+    """Yield a folder for files that get into `folder` together at the end, or not at all.
+
+    The summary is the last one. Ctrl-C waits while they get their places.
+
+    Raises:
+        OutputError: the disk is full, for instance.
+    """
+    place = folder / WRITTEN
+    shutil.rmtree(place, ignore_errors=True)  # of a run that was killed
+    make_folder(place)
+    try:
+        yield place
+        paths = sorted(place.iterdir(), key=lambda path: path.name == RUN_FILES[0])
+        with interrupted_later(), writing(folder):
+            for path in paths:
+                os.replace(path, folder / path.name)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+
+
 def check_new(files: Iterable[Path], hint: str = "") -> None:
     """Raise InputError if one of the files exists; `hint` ends the message."""
     for path in files:
@@ -192,25 +217,28 @@ def record_of_parts(design: Path | None, folder: Path, files: Iterable[str]) -> 
     return record
 
 
-def stale_parts(folder: Path) -> str:
-    """Return why a folder's parts are not those of the design beside them; "" if they may be."""
+def stale_parts(folder: Path, now: Path | None = None) -> str:
+    """Return why a folder's parts are not those of the design beside them; "" if they may be.
+
+    `now` is the file of a design that is to take that one's place.
+    """
     made_of = read_record(folder / PARTS_LIST).get("design")
     if not isinstance(made_of, dict) or not isinstance(made_of.get("file"), str):
         return ""
-    design = folder / made_of["file"]
-    if not design.is_file() or file_digest(design) == made_of.get("sha256"):
+    design = Path(os.path.normpath(folder / made_of["file"]))
+    now = now or design
+    if not now.is_file() or file_digest(now) == made_of.get("sha256"):
         return ""
-    design = Path(os.path.normpath(design))
     return (
         f"{folder}: parts of another design than {design} holds now; make them anew: dolfinopt "
         f"part {design.parent} --overwrite"
     )
 
 
-def remove_stale_parts(run: Path) -> str:
-    """Remove the parts in a run's folder unless they are of its design; return what was done."""
+def remove_stale_parts(run: Path, design: Path) -> str:
+    """Remove a run's parts unless they are of its new design; return what was done."""
     folder = run / PARTS
-    if not stale_parts(folder):
+    if not stale_parts(folder, design):
         return ""
     names = [name for name in read_record(folder / PARTS_LIST).get("files", []) if _is_name(name)]
     remove_stale(folder, [PARTS_LIST, *names])

@@ -1,6 +1,6 @@
 """What a run leaves in its folder, and an optimisation that writes as it goes or is resumed.
 
-The summary is written last: a folder that holds one is complete.
+Results get into the folder together, the summary last: a folder that holds one is complete.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from dolfinopt.output.folders import (
     check_unused,
     remove_stale_parts,
     working_alone,
+    written_together,
 )
 from dolfinopt.output.summary import summarise, write_budget, write_summary
 from dolfinopt.output.trajectory import write_trajectory
@@ -49,7 +50,7 @@ from dolfinopt.scene.schema import named_files, with_relative_paths
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
-Draw = Callable[[list[ArmView]], None]
+Draw = Callable[[Path, list[ArmView]], None]
 
 
 @dataclass(frozen=True)
@@ -68,14 +69,16 @@ def write_result(
     paraview: bool = True,
     pictures: Draw | None = None,
 ) -> Written | None:
-    """Write design, trajectory and summary of a result (collective); None but on the root.
+    """Write design, trajectory and summary of a result, all or none (collective).
+
+    Returns None but on the root.
 
     Args:
         folder: exists; of an optimisation history and checkpoint are there already.
         result: what came of a simulation or an optimisation.
         wall: seconds that it took up to now; the summary's total also counts what follows.
         paraview: write design.vtu, too.
-        pictures: called with the arms' views before the summary is written, on the root.
+        pictures: draws the arms' views in a folder before the summary is written, on the root.
     """
     begun = time.perf_counter() - wall
     stress = stress_report(result.partition, result.arms, result.trajectory, result.profile)
@@ -86,23 +89,24 @@ def write_result(
     with together(result.partition.world):
         if result.trajectory is None:
             return None
-        write_design(folder, views, result.scene)
-        if removed := remove_stale_parts(folder):
-            summary["warnings"].append(removed)
-        if paraview:
-            write_fields(folder, views)
-        write_trajectory(folder, result.trajectory, result.initial_deviation)
-        write_feed_forward(folder, result.trajectory)
-        write_budget(folder, summary["deflection_budget"])
-        if pictures is not None:
-            since = time.perf_counter()
-            pictures(views)
-            del summary["seconds"]["total"]  # stands last
-            summary["seconds"]["pictures"] = time.perf_counter() - since
-        summary["seconds"]["total"] = time.perf_counter() - begun
-        summary["files"] = {name: row[key] for name, row, key in named_files(summary["scene"])}
-        summary["scene"] = with_relative_paths(summary["scene"], folder)
-        write_summary(folder, summary)
+        with written_together(folder) as place:
+            write_design(place, views, result.scene)
+            if removed := remove_stale_parts(folder, place / "design.npz"):
+                summary["warnings"].append(removed)
+            if paraview:
+                write_fields(place, views)
+            write_trajectory(place, result.trajectory, result.initial_deviation)
+            write_feed_forward(place, result.trajectory)
+            write_budget(place, summary["deflection_budget"])
+            if pictures is not None:
+                since = time.perf_counter()
+                pictures(place, views)
+                del summary["seconds"]["total"]  # stands last
+                summary["seconds"]["pictures"] = time.perf_counter() - since
+            summary["seconds"]["total"] = time.perf_counter() - begun
+            summary["files"] = {name: row[key] for name, row, key in named_files(summary["scene"])}
+            summary["scene"] = with_relative_paths(summary["scene"], folder)
+            write_summary(place, summary)
         return Written(views, summary)
 
 

@@ -235,9 +235,8 @@ def _drive_rows(trajectory: Trajectory) -> Iterator[list[Panel]]:
         return Panel(f"{label} [{shown}]", TIME, "", lines, y_log=False, note=note)
 
     scene, words = trajectory.scene, {"N": "force", "N m": "moment"}
-    places = map(int, np.arange(scene.num_rigid)[scene.driven_columns])
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
-    for (name, unit), k in zip(drive_units(scene).items(), places, strict=True):
+    for (name, unit), k in zip(drive_units(scene).items(), scene.driven_columns, strict=True):
         row = [panel(f"{name}: {words[unit]}", unit, trajectory.joint_forces[:, k])]
         if name in free:
             row.insert(0, panel(f"{name}: error", scene.rigid_units[name], error[:, k]))

@@ -32,6 +32,7 @@ from dolfinopt.scene.messages import (
     misplaced,
     model_at,
     unknown_key,
+    value_at,
     wrong_value,
 )
 from dolfinopt.scene.old_words import OLD_KEYS, read_old_words, scaled
@@ -53,7 +54,6 @@ from dolfinopt.scene.tables.arms import (
 from dolfinopt.scene.tables.base import (
     Loc,
     Refusal,
-    Table,
     cut,
     input_error,
     loc_of,
@@ -64,13 +64,11 @@ from dolfinopt.scene.tables.base import (
 from dolfinopt.scene.tables.closures import (
     OLD,
     OLD_CLOSURE,
-    Closures,
     read_old_closure,
     take_old_keys,
 )
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.joints import DRIVE_KEYS, INBOARD, OF_BEARINGS, OUTBOARD
-from dolfinopt.scene.tables.machine import Force, Joint
 from dolfinopt.scene.tables.material import material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction
 from dolfinopt.scene.tables.objective import Objective, WorstBy
@@ -94,13 +92,6 @@ __all__ = [
     "tomllib",
 ]
 
-# Arrays of tables whose entries --set addresses by name or number.
-NAMED: dict[str, type[Table]] = {
-    "arms": Arm,
-    "joints": Joint,
-    "closures": Closures,
-    "forces": Force,
-}
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 
@@ -175,7 +166,7 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     try:
         scene = Scene.model_validate({key: tree[key] for key in tree if key != OLD})
     except ValidationError as error:
-        message = first_problem(error, tree, inherited, source, changes)
+        message = first_problem(error, tree, source, changes)
         raise InputError(message) from None
     scene._source = source
     scene._derived = derived
@@ -409,18 +400,8 @@ def _override(tree: dict[str, Any], text: str, source: str) -> Override:
         if loc == ("material", "name") or (loc[0] == "arms" and loc[2:] == ("material",)):
             _drop_values(tree, loc)
         given = _parse_value(value.strip())
-        _store(tree, loc, scaled(_value_at(tree, loc), given) if times else given)
+        _store(tree, loc, scaled(value_at(loc, tree)[0], given) if times else given)
     return Override(text, tuple(loc[:2] if _is_old(loc) else loc for loc in locs))
-
-
-def _value_at(tree: Any, loc: Loc) -> Any:
-    """Return what the tree states at `loc`, or else the key's default."""
-    for part in loc:
-        try:
-            tree = tree[part]
-        except (KeyError, IndexError, TypeError):
-            return field_at(loc).default
-    return tree
 
 
 def _is_old(loc: Loc) -> bool:
@@ -454,9 +435,9 @@ def _parse_value(text: str) -> Any:
 def _override_locs(tree: dict[str, Any], parts: tuple[str, ...], where: str) -> tuple[Loc, ...]:
     """Return the paths that the dotted key `parts` means; raise InputError if there are none."""
     locs: tuple[Loc, ...] = (parts,)
-    table = parts[0]
-    if table in NAMED and len(parts) > 1 and (table in tree or table == "arms"):
-        members, fields = rows(tree, table), NAMED[table].model_fields
+    table, fields = parts[0], getattr(model_at(parts[:1]), "model_fields", {})
+    if "name" in fields and _is_array(parts[:1]) and len(parts) > 1 and table in {*tree, "arms"}:
+        members = rows(tree, table)
         if len(parts) == 2 and (parts[1] in fields or _is_old(parts)):
             locs = tuple((table, i, parts[1]) for i in range(len(members)))
         else:

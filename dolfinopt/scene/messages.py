@@ -42,35 +42,23 @@ class Override:
     locs: tuple[Loc, ...]
 
 
-@dataclass(frozen=True)
-class _Problem:
+class _Problem(NamedTuple):
     """One rejected key: what to print, and the paths of all keys involved, reported one first."""
 
     text: str
     locs: tuple[Loc, ...]
-    kind: str
+    unknown: bool = False
 
 
 def first_problem(
-    error: ValidationError,
-    tree: dict[str, Any],
-    inherited: set[Loc],
-    source: str,
-    changes: list[Override],
+    error: ValidationError, tree: dict[str, Any], source: str, changes: list[Override]
 ) -> str:
-    """Return the one-line message of the first problem and the number of others."""
+    """Return the one-line message of the first problem."""
     problems = [_problem(dict(item), tree) for item in error.errors(include_url=False)]
-    # Wrong elements of one array are one problem, and so are the kinds of value that a key takes.
-    places = [(problem.kind, problem.locs) for problem in problems]
-    problems = [entry for i, entry in enumerate(problems) if places[i] not in places[:i]]
-    known = {(problem.kind, problem.locs) for problem in problems}
-    problems = [problem for problem in problems if not _is_echo(problem, tree, inherited, known)]
     # A misspelt key is also a missing one: the spelling is the message that helps.
-    problems.sort(key=lambda problem: problem.kind != "unknown")
-    first, n_more = problems[0], len(problems) - 1
+    first = min(problems, key=lambda problem: not problem.unknown)
     where = blamed(source, changes, (*first.locs, *(as_written(loc, tree) for loc in first.locs)))
-    more = f" (and {n_more} more)" if n_more else ""
-    return one_line(f"{where}: {first.text}{more}")
+    return one_line(f"{where}: {first.text}")
 
 
 def blamed(source: str, changes: Sequence[Override], locs: tuple[Loc, ...]) -> str:
@@ -82,24 +70,6 @@ def blamed(source: str, changes: Sequence[Override], locs: tuple[Loc, ...]) -> s
     return where
 
 
-def _is_echo(
-    problem: _Problem,
-    tree: dict[str, Any],
-    inherited: set[Loc],
-    known: set[tuple[str, tuple[Loc, ...]]],
-) -> bool:
-    """Tell whether the arm before has the same problem and this one only took it over."""
-    before = []
-    for loc in problem.locs:
-        if loc[0] != "arms" or len(loc) < 3:
-            return False
-        unstated = loc[2] not in tree["arms"][loc[1]] and loc[2] != "name"
-        if loc[:3] not in inherited and not unstated:
-            return False
-        before.append(("arms", loc[1] - 1, *loc[2:]))
-    return (problem.kind, tuple(before)) in known
-
-
 def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
     """Translate one of pydantic's errors."""
     raw: Loc = item["loc"]
@@ -107,21 +77,21 @@ def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
     if item["type"] in ("extra_forbidden", "invalid_key"):
         model = model_at(loc[:-1])
         fields = model.model_fields if model else {}
-        return _Problem(unknown_key(loc[:-1], loc[-1], fields, tree), (loc,), "unknown")
+        return _Problem(unknown_key(loc[:-1], loc[-1], fields, tree), (loc,), True)
     if item["type"] == "missing" and len(raw) == len(loc):
         field = field_at(loc)
         text = f"missing key {dotted(loc, tree)} ({_meaning(field)})"
         if field.examples:
             text = f"missing table [{loc[-1]}] ({_meaning(field)}); write {field.examples[0]}"
-        return _Problem(text, (loc,), "missing")
+        return _Problem(text, (loc,))
     reason = item.get("ctx", {}).get("error")
     if isinstance(reason, Refusal):
         locs = tuple((*loc, *key) for key in reason.keys) or (loc,)
-        return _Problem(f"{_found(locs[0], tree)}: {reason.reason}", locs, "value")
+        return _Problem(f"{_found(locs[0], tree)}: {reason.reason}", locs)
     text = wrong_value(loc, tree)
     if item["type"] == "finite_number":
         text = text.replace(" number", " finite number")
-    return _Problem(text, (loc,), "value")
+    return _Problem(text, (loc,))
 
 
 def wrong_value(loc: Loc, tree: dict[str, Any]) -> str:
@@ -263,13 +233,18 @@ def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "
 
 def _found(loc: Loc, tree: dict[str, Any]) -> str:
     """Return "key.path = value" for the value at `loc`, or for its default."""
-    node: Any = tree
+    value, stated = value_at(loc, tree)
+    return f"{dotted(loc, tree)} = {shown(value)}" + " (default)" * (not stated)
+
+
+def value_at(loc: Loc, tree: Any) -> tuple[Any, bool]:
+    """Return what a scene's data state at `loc`, or else the key's default, and whether they do."""
     for part in loc:
         try:
-            node = node[part]
+            tree = tree[part]
         except (KeyError, IndexError, TypeError):
-            return f"{dotted(loc, tree)} = {shown(field_at(loc).default)} (default)"
-    return f"{dotted(loc, tree)} = {shown(node)}"
+            return field_at(loc).default, False
+    return tree, True
 
 
 def dotted(loc: Loc, tree: dict[str, Any]) -> str:

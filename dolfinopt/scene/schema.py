@@ -296,7 +296,7 @@ class Scene(Table):
     @property
     def num_rigid(self) -> int:
         """Number of rigid coordinates: cart and arms, or joints in space that move, and rods."""
-        return len(self.movable) + len(self.rods) if self.is_spatial else 1 + len(self.arms)
+        return len(self.rigid_units)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -307,22 +307,17 @@ class Scene(Table):
     @property
     def joint_columns(self) -> tuple[int | None, ...]:
         """Place of every arm's inboard joint among the rigid coordinates; None of a fixed one."""
-        if not self.is_spatial:
-            return tuple(range(1, 1 + len(self.arms)))
-        places = {joint.child: i for i, joint in enumerate(self.movable)}
-        return tuple(places.get(arm.name) for arm in self.arms)
+        places = {name: k for k, name in enumerate(self.rigid_units)}
+        return tuple(places.get(name) for name in self.joint_names)
 
     @property
-    def driven_columns(self) -> slice | list[int]:
+    def driven_columns(self) -> list[int]:
         """Where the drives stand among all rigid coordinates: cart, then the arms.
 
         A fixed base is no drive, and neither are joints that follow from the others in a loop.
         """
-        if self.closures:
-            names = list(self.rigid_units)
-            return [names.index(name) for name in self.driven]
-        first = 1 if self.motion.is_fixed and not self.is_spatial else 0
-        return slice(first, first + len(self.driven))
+        names = list(self.rigid_units)
+        return [names.index(name) for name in self.driven]
 
     def material_of(self, index: int) -> Material:
         """Return the material of arm number `index`: its own values, or else the scene's.

@@ -19,12 +19,12 @@ import math
 import os
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 from uuid import uuid4
 
 import numpy as np
@@ -195,6 +195,11 @@ class Outcomes:
         return [outcome for outcome in self.by_case.values() if outcome.failure]
 
 
+T = TypeVar("T")
+# What a study asks for, set by set of cases, each by what came of the sets before; and its end.
+Steps = Generator[Sequence[Case], Outcomes, T]
+
+
 @dataclass
 class Runner:
     """Where a study does its cases, see `run_cases`, and how many were computed."""
@@ -205,11 +210,26 @@ class Runner:
     keep: bool = True
     computed: int = 0
 
-    def run(self, cases: Iterable[Case]) -> Outcomes:
-        """Do the cases that are not done yet (collective)."""
-        done = run_cases(cases, self.folder, self.world, shown=self.shown, keep=self.keep)
-        self.computed += done.computed
-        return done
+    def follow(self, steps: Steps[T]) -> T:
+        """Do the cases that steps ask for (collective); return their end on all ranks.
+
+        The root alone goes through them: what they read, write and decide is done once.
+        """
+        outcomes: Outcomes | None = None
+        while True:
+            cases, end = on_root(self.world, _advance, steps, outcomes)
+            if cases is None:
+                return end
+            outcomes = run_cases(cases, self.folder, self.world, shown=self.shown, keep=self.keep)
+            self.computed += outcomes.computed
+
+
+def _advance(steps: Steps[T], outcomes: Outcomes) -> tuple[Sequence[Case] | None, T | None]:
+    """Return the next cases of steps, or None and their end."""
+    try:
+        return steps.send(outcomes), None
+    except StopIteration as stop:
+        return None, stop.value
 
 
 def scene_content(scene: Scene, but: frozenset[str] = frozenset()) -> dict[str, Any]:

@@ -56,7 +56,7 @@ def draw(figure: tables.Figure, styles: Looks | None = None) -> Figure:
     if isinstance(figure, tables.DesignFigure):
         return design_figure(figure)
     if isinstance(figure, LineFigure):
-        return line_figure(figure, styles)
+        return panel_figure("", [[panel] for panel in figure.panels], styles)
     if figure.kind == "matrix":
         return matrix_figure(figure)
     return histogram_figure(figure, styles)
@@ -76,15 +76,6 @@ def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") ->
     axes.set_title(title)
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
-
-
-# -- curves ----------------------------------------------------------------------------------
-
-
-def line_figure(figure: LineFigure, styles: Looks | None = None) -> Figure:
-    """Return the panels below each other."""
-    rows = [[panel] for panel in figure.panels]
-    return panel_figure("", rows, styles or common_looks([figure]))
 
 
 # -- tables and samples ------------------------------------------------------------------------

@@ -23,10 +23,10 @@ from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.output.feed_forward import finer_deviation, simulated_with, with_feed_forward
-from dolfinopt.parallel import Partition, on_root, together
+from dolfinopt.parallel import Partition
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
-from dolfinopt.study.cases import Case, Outcome, Runner
+from dolfinopt.study.cases import Case, Outcome, Steps
 from dolfinopt.study.studies import DEVIATION, deviation_panels, single_design
 from dolfinopt.study.tables import LineFigure, Study, Table
 
@@ -62,36 +62,34 @@ class Motion(NamedTuple):
     finer: float | None = None
 
 
-def study_motions(scene: Scene, designs: Sequence[Path], runner: Runner) -> Study:
-    """Compare motions of a scene's machine (collective).
+def study_motions(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps[Study]:
+    """Return the steps of comparing motions of a scene's machine.
 
     Args:
         scene: whose arms move.
         designs: design.npz of the arms; none: they are optimised, for the rigid path and again for
             feed-forward.
-        runner: of all cases.
+        folder: of the study, for tables of shaped joints.
 
     Raises:
         InputError: the scene's motion cannot be corrected or shaped; nothing was computed.
     """
-    _, design = on_root(runner.world, single_design, scene, designs, NAME)
-    with together(runner.world):
-        with_feed_forward(scene, "tip")  # refused where the motion cannot be corrected
-    files = [design]
+    _, design = single_design(scene, designs, NAME)
+    forward = with_feed_forward(scene, "tip")  # refused where the motion cannot be corrected
+    files: list[Any] = [design]
     if isinstance(design, Case):
-        searched = [design, Case(with_feed_forward(scene, "tip"), "optimize", label=DESIGNED)]
-        result = runner.run(searched)
+        searched = [design, Case(forward, "optimize", label=DESIGNED)]
+        result = yield searched
         if result.failures:
             failed = tuple(text for failure in result.failures for text in failure.failures)
-            return Study(NAME, (), (), failed, runner.computed)
+            return Study(NAME, (), (), failed)
         files = [result[item].design for item in searched]
-    motions = on_root(runner.world, _motions, scene, files, runner.folder / NAME)
-    done = runner.run(motion.case for motion in motions)
+    motions = _motions(scene, files, folder / NAME)
+    done = yield [motion.case for motion in motions]
     rows = [(motion, done[motion.case]) for motion in motions]
-    with together(runner.world):
-        table, figure = report(scene, rows)
+    table, figure = report(scene, rows)
     failed = tuple(text for _, outcome in rows for text in outcome.failures)
-    return Study(NAME, (table,), (figure,), failed, runner.computed)
+    return Study(NAME, (table,), (figure,), failed)
 
 
 def machines(scene: Scene) -> dict[str, str]:
@@ -108,7 +106,7 @@ def machines(scene: Scene) -> dict[str, str]:
 
 
 def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list[Motion]:
-    """Return the motions with the first design, and feed-forward with the second (root only)."""
+    """Return the motions with the first design, and feed-forward with the second."""
     rigid, forward = (_judged(with_feed_forward(scene, kind)) for kind in ("none", "tip"))
     first = designs[0]
     place = arms_with_design(MPI.COMM_SELF, rigid, first, Profile())
@@ -152,7 +150,7 @@ def _finer_deviation(scene: Scene, place: Place) -> float | None:
 def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
     """Write the joints of a scene's shaped motion as a table; return the scene that follows it."""
     motion = desired_motion(scene)
-    joints = np.arange(scene.num_rigid)[scene.driven_columns]
+    joints = scene.driven_columns
     end = scene.motion.duration + shaper.longer
     t = np.linspace(0.0, end, ROWS)
     shaped = shaper.shaped(lambda t: motion(t).q[:, joints], t)

@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,17 +28,15 @@ from dolfinopt.disk import make_folder, write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.hollow import KINDS, Section, member
 from dolfinopt.mesh.solid_cells import msh_bytes
-from dolfinopt.parallel import on_root, together
 from dolfinopt.progress import with_unit
 from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.schema import file_digest
 from dolfinopt.scene.tables.arms import WALL_KEYS
-from dolfinopt.study.cases import Case, Outcome, Runner
+from dolfinopt.study.cases import Case, Outcome, Steps
 from dolfinopt.study.studies import (
     COMPLIANCE,
     DEVIATION,
-    Design,
     deviation_panels,
     results_of,
     single_design,
@@ -66,7 +64,6 @@ SLIGHT = 0.01  # relative excess of a limit by the design up to which it is told
 OF_MATERIAL = ("volume_fraction", "mass")
 
 Shares = tuple[float, ...]  # of every designed arm, in the scene's order
-Simulate = Callable[[Sequence[Shares]], Sequence[Outcome]]
 Found = tuple[Shares, bool] | None  # whether they hold; None: no simulation succeeded
 
 
@@ -81,13 +78,13 @@ class Members:
         scene: whose designed arms are replaced.
         kind: of the section, in words.
         section: itself.
-        runner: in whose folder their meshes are, and their simulations.
+        folder: of the study; their meshes are in its folder `NAME`.
     """
 
     scene: Scene
     kind: str
     section: Section
-    runner: Runner
+    folder: Path
 
     @property
     def arms(self) -> tuple[int, ...]:
@@ -139,7 +136,7 @@ class Members:
         return ", ".join(texts)
 
     def case(self, shares: Shares) -> Case:
-        """Return the simulation of the members; their meshes are written (root only)."""
+        """Return the simulation of the members; their meshes are written."""
         data = self.scene.to_tree()
         rows: dict[int | None, dict[str, Any]]
         rows = {k: self._row(k, share) for k, share in zip(self.arms, shares, strict=True)}
@@ -163,7 +160,7 @@ class Members:
             return row | {"height": height, "thickness": thickness, "cells": list(cells)}
         mesh = member(self.section, arm.length, (arm.height, arm.thickness), share)
         data = msh_bytes(mesh)
-        path = self.runner.folder / NAME / f"{hashlib.sha256(data).hexdigest()[:16]}.msh"
+        path = self.folder / NAME / f"{hashlib.sha256(data).hexdigest()[:16]}.msh"
         if not path.exists():
             make_folder(path.parent)
             write_bytes(path, data)
@@ -179,13 +176,6 @@ def _bar_cells(length: float, height: float, thickness: float, solid: bool) -> t
     least = min(sides)
     across = tuple(min(most, round(small * side / least)) for side in sides)
     return max(24, round(2.0 * length / max(sides))), *across
-
-
-def simulated(pairs: Sequence[tuple[Members, Shares]], runner: Runner) -> list[Outcome]:
-    """Simulate members with their shares (collective)."""
-    cases = on_root(runner.world, lambda: [members.case(shares) for members, shares in pairs])
-    done = runner.run(cases)
-    return [done[case] for case in cases]
 
 
 # -- the lightest that hold the limits -----------------------------------------------------------
@@ -206,7 +196,7 @@ def _excess(limit: Mapping[str, Any]) -> float:
     return float(-gap if limit["bound"] == "least" else gap)
 
 
-def lightest(members: Members, simulate: Simulate) -> Found:
+def lightest(members: Members) -> Steps[Found]:
     """Search the lightest members that hold the limits.
 
     Returns:
@@ -214,17 +204,16 @@ def lightest(members: Members, simulate: Simulate) -> Found:
         no simulation succeeded.
     """
     count, move = len(members.arms), MOVE
-    result = _on_limit(members, simulate, (members.most,) * count)
+    result = yield from _on_limit(members, (members.most,) * count)
     if result is None or not result[1]:
         return result
     best = result[0]
     while count > 1 and move >= LEAST_MOVE:
         stepped = [_stepped(members, best, k) for k in range(count)]
-        outcomes = simulate([best, *stepped])
-        balanced = on_root(
-            members.runner.world, _balanced, members, best, stepped, outcomes, move
-        )  # others' last digits may differ
-        result = _on_limit(members, simulate, balanced)
+        cases = [members.case(shares) for shares in (best, *stepped)]
+        done = yield cases
+        balanced = _balanced(members, best, stepped, [done[case] for case in cases], move)
+        result = yield from _on_limit(members, balanced)
         gain = 0.0
         if result is not None and result[1]:
             gain = 1.0 - members.total_mass(result[0]) / members.total_mass(best)
@@ -234,13 +223,14 @@ def lightest(members: Members, simulate: Simulate) -> Found:
     return best, True
 
 
-def _on_limit(members: Members, simulate: Simulate, shares: Shares) -> Found:
+def _on_limit(members: Members, shares: Shares) -> Steps[Found]:
     """Search the least factor of all shares with which the members hold the limits."""
     low, high = math.log(LEAST / max(shares)), math.log(members.most / min(shares))
     excess: dict[float, float] = {}
     x: float | None = 0.0
     while x is not None and len(excess) < STEPS:
-        [outcome] = simulate([members.scaled(shares, x)])
+        case = members.case(members.scaled(shares, x))
+        outcome = (yield [case])[case]
         failed = bool(outcome.failure)
         excess[x] = math.inf if failed else max(limited(outcome).values(), default=math.inf)
         x = _next(excess, low, high)
@@ -370,44 +360,40 @@ def _limits(outcome: Outcome) -> dict[str, Any]:
     return {name: limit for name, limit in result.items() if not name.startswith("volume_fraction")}
 
 
-def study_sections(scene: Scene, designs: Sequence[Path], runner: Runner) -> Study:
-    """Compare straight members with the design (collective).
+def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps[Study]:
+    """Return the steps of comparing straight members with the design.
 
     Args:
         scene: whose designed arms are replaced, all by one kind of section.
         designs: design.npz of the design; none: it is optimised.
-        runner: of all simulations.
+        folder: of the study, for the members' meshes.
 
     Raises:
         InputError: the scene's arms cannot be replaced; nothing was computed.
     """
-    label, design = on_root(runner.world, _checked, scene, designs)
+    _check_replaceable(scene)
+    label, design = single_design(scene, designs, NAME)
     own = Case(scene, "simulate", design, DESIGN)
-    first = Row(DESIGN, label, "", runner.run([own])[own])
+    first = Row(DESIGN, label, "", (yield [own])[own])
     if first.outcome.failure:
-        return Study(NAME, (), (), tuple(first.outcome.failures), runner.computed)
-    every = [
-        Members(scene, kind, section, runner) for kind, section in KINDS[scene.dimension].items()
-    ]
+        return Study(NAME, (), (), tuple(first.outcome.failures))
+    kinds = KINDS[scene.dimension].items()
+    every = [Members(scene, kind, section, folder) for kind, section in kinds]
     asked: list[tuple[Members, str, Shares, bool]] = []
     for members in every if limited(first.outcome) else ():
-
-        def simulate(wanted: Sequence[Shares]) -> list[Outcome]:
-            return simulated([(members, shares) for shares in wanted], runner)  # noqa: B023
-
-        if result := lightest(members, simulate):
+        if result := (yield from lightest(members)):
             shares, holds = result
             asked.append((members, "lightest" if holds else "nearest to the limits", shares, holds))
     asked += [(members, SAME, shares, False) for members, shares in _as_heavy(every, first.outcome)]
-    outcomes = simulated([(members, shares) for members, _, shares, _ in asked], runner)
+    cases = [members.case(shares) for members, _, shares, _ in asked]
+    done = yield cases
     rows = [first]
-    for (members, sizing, shares, light), outcome in zip(asked, outcomes, strict=True):
+    for (members, sizing, shares, light), case in zip(asked, cases, strict=True):
         sizes = f"{members.section.named}: {members.sizes(shares)}"
-        rows.append(Row(members.kind, sizing, sizes, outcome, light))
-    with together(runner.world):
-        found_table, figures = report(scene, rows)
+        rows.append(Row(members.kind, sizing, sizes, done[case], light))
+    table, figures = report(scene, rows)
     # A member that is too soft to be simulated is a finding, in its row, and no failure.
-    return Study(NAME, (found_table,), figures, (), runner.computed)
+    return Study(NAME, (table,), figures)
 
 
 def _as_heavy(every: Sequence[Members], outcome: Outcome) -> list[tuple[Members, Shares]]:
@@ -421,25 +407,26 @@ def _as_heavy(every: Sequence[Members], outcome: Outcome) -> list[tuple[Members,
 AHEAD = ("solid bar", "rectangular tube", "round tube")  # whose figures come before a design
 
 
-def ahead(scene: Scene, runner: Runner) -> list[str]:
-    """Return what straight tubes and bars reach in place of solid links, a line each (collective).
+def ahead(scene: Scene, folder: Path) -> Steps[list[str]]:
+    """Return the steps to what straight tubes and bars reach in place of solid links, a line each.
 
     Those of the links' mass at the start, and the limit that each uses most: three simulations.
     [] of machines in the plane, and where no straight member can take a link's place.
     """
     try:
-        on_root(runner.world, _check_replaceable, scene)
+        _check_replaceable(scene)
     except InputError:
         return []
     if not any(scene.arms[k].is_solid and not scene.arms[k].hollow for k in scene.designed):
         return []
     start = Case(scene, label="start")
-    first = runner.run([start])[start]
+    first = (yield [start])[start]
     if first.failure:
         return []
-    every = _as_heavy([Members(scene, kind, KINDS[3][kind], runner) for kind in AHEAD], first)
-    pairs = zip(every, simulated(every, runner), strict=True)
-    reached = [(item, outcome) for (item, _), outcome in pairs if not outcome.failure]
+    every = [Members(scene, kind, KINDS[3][kind], folder) for kind in AHEAD]
+    cases = {members.case(shares): members for members, shares in _as_heavy(every, first)}
+    done = yield [*cases]
+    reached = [(item, done[case]) for case, item in cases.items() if not done[case].failure]
     lines = [_reached(scene, *item) for item in reached]
     if any(item.section.plane is not None for item, _ in reached):
         lines.append("with walls, arms.hollow = true, a link keeps a tube's outer surface")
@@ -456,12 +443,6 @@ def _reached(scene: Scene, members: Members, outcome: Outcome) -> str:
         value = f"{value}, {with_unit(used, most['unit'])}"
     mass = outcome.summary()["designed_mass"]
     return f"a straight {members.kind} of the links' mass at the start, {mass:.3g} kg: {value}"
-
-
-def _checked(scene: Scene, designs: Sequence[Path]) -> tuple[str, Design]:
-    """Return the design and its label; raise InputError where no member can take an arm's place."""
-    _check_replaceable(scene)
-    return single_design(scene, designs, NAME)
 
 
 def _check_replaceable(scene: Scene) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -21,11 +21,10 @@ from mpi4py import MPI
 
 from dolfinopt.errors import InputError
 from dolfinopt.output.design import arms_with_design
-from dolfinopt.parallel import on_root, together
 from dolfinopt.plots.panels import Line, Panel
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.cases import Case, Outcome, Runner
+from dolfinopt.study.cases import Case, Outcome, Runner, Steps
 from dolfinopt.study.tables import (
     DesignFigure,
     Figure,
@@ -54,7 +53,7 @@ from dolfinopt.study.variants import (
 Item = TypeVar("Item")
 Preset = Literal["payload", "flattening", "coordinates", "objective", "reduction"]
 Design = Case | Path | None  # optimised by a case, of a file, or the initial one
-Rows = list[tuple[Mapping[str, Any], Case]]
+Rows = list[tuple[dict[str, Any], Case]]
 Report = tuple[list[Table], list[Figure]]
 
 COMPLIANCE, DEVIATION = QUANTITIES = ("compliance [N m]", "maximal deviation [mm]")
@@ -71,52 +70,76 @@ MADE = "made for it"  # the design that was optimised for the scenario it is sim
 # -- the run ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Cases to do, and what to make of them; pickled from the root to all ranks."""
-
-    name: str  # of the study's files
-    rows: Sequence[tuple[Mapping[str, Any], Case]]  # labels by column, and the case of each
-    report: Callable[[pd.DataFrame], Report]  # of the frame of all rows, see `tabulated`
-
-
 def study(
     scene: Scene,
     preset: Preset | None,
     vary: Sequence[str],
     designs: Sequence[Path],
-    runner: Runner,
     *,
     reoptimize: bool = False,
     kinds: Sequence[str] = (),
-) -> Study:
-    """Do a study (collective); the result is the same on all ranks.
+) -> Steps[Study]:
+    """Return the steps of a study, see `carry_out`.
 
     Args:
         scene, preset: what is varied; which study, None for a sweep over `vary` alone.
         vary: values to sweep over, see `parse_vary`; in place of the preset's own.
         designs: design.npz files to simulate in place of the initial and the optimised design.
-        runner: of all cases.
         reoptimize: optimise for every scenario, too.
         kinds: of objectives to compare; by default all.
 
     Raises:
         InputError: something asked for is not possible; nothing was computed.
     """
-    plan = on_root(runner.world, _plan, scene, preset, vary, designs, reoptimize, kinds)
-    if any(case.action == "optimize" for _, case in plan.rows):
-        scene.check_designed()
-    return carry_out(plan, runner)
+    asked = [parse_vary(text) for text in vary]
+    keys = [item.key for item in asked]
+    if twice := [key for key in keys if keys.count(key) > 1]:
+        raise InputError(f"--vary {twice[0]} twice; give all its values in one")
+    if preset is None or preset in RANGES:
+        if preset is not None and (own := parse_vary(RANGES[preset])).key not in keys:
+            asked.insert(0, own)
+        if not asked:
+            raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
+        name = sweep_name(preset, vary)
+        return (yield from sweep_steps(scene, name, asked, designs, reoptimize))
+    command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
+    if others := [item.text for item in asked if preset == "objective" or item.key != COORDINATES]:
+        only = "none" if preset == "objective" else f"only {COORDINATES}"
+        raise InputError(f"--vary {others[0]}: expected {only} with {command}")
+    if preset != "coordinates" and designs:
+        raise InputError(f"--design: expected none with {command}, which makes its own")
+    if reoptimize:
+        raise InputError(f"--reoptimize: not with {command}; see compare reductions")
+    counts = asked[0].whole_numbers if asked else None
+    if preset == "objective":
+        return (yield from objective_steps(scene, kinds))
+    if preset == "reduction":
+        return (yield from reduction_steps(scene, counts))
+    return (yield from coordinates_steps(scene, designs, counts))
 
 
-def carry_out(plan: Plan, runner: Runner) -> Study:
-    """Do what is planned, see `study`."""
-    outcomes = runner.run(case for _, case in plan.rows)
-    with together(runner.world):
-        rows = ((labels, outcomes[case]) for labels, case in plan.rows)
-        tables, figures = plan.report(tabulated(rows))
+def carry_out(steps: Steps[Study], runner: Runner) -> Study:
+    """Do what a study asks for (collective); the result is the same on all ranks."""
+    return replace(runner.follow(steps), computed=runner.computed)
+
+
+def reported(name: str, rows: Rows, report: Callable[[pd.DataFrame], Report]) -> Steps[Study]:
+    """Return the steps of a study that asks for all its cases at once.
+
+    Args:
+        name: of its files.
+        rows: labels by column, and the case of each.
+        report: tables and figures of the frame of all rows, see `tabulated`.
+    """
+    cases = [case for _, case in rows]
+    for case in cases:
+        if case.action == "optimize":
+            case.scene.check_designed()
+    outcomes = yield cases
+    frame = tabulated((labels, outcomes[case]) for labels, case in rows)
+    tables, figures = report(frame)
     failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)
-    return Study(plan.name, tuple(tables), tuple(figures), failures, runner.computed)
+    return Study(name, tuple(tables), tuple(figures), failures)
 
 
 def tabulated(rows: Iterable[tuple[Mapping[str, Any], Outcome]]) -> pd.DataFrame:
@@ -149,41 +172,6 @@ def sweep_name(preset: Preset | None, vary: Sequence[str]) -> str:
     own = COORDINATES if preset == "coordinates" else RANGES.get(preset or "", "").split("=")[0]
     keys = [text.partition("=")[0].strip() for text in vary]
     return file_name(preset or "", *(key for key in keys if key != own))
-
-
-def _plan(
-    scene: Scene,
-    preset: Preset | None,
-    vary: Sequence[str],
-    designs: Sequence[Path],
-    reoptimize: bool,
-    kinds: Sequence[str],
-) -> Plan:
-    """Check what is asked and plan it (root only)."""
-    asked = [parse_vary(text) for text in vary]
-    keys = [item.key for item in asked]
-    if twice := [key for key in keys if keys.count(key) > 1]:
-        raise InputError(f"--vary {twice[0]} twice; give all its values in one")
-    if preset is None or preset in RANGES:
-        if preset is not None and (own := parse_vary(RANGES[preset])).key not in keys:
-            asked.insert(0, own)
-        if not asked:
-            raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
-        return sweep_plan(scene, sweep_name(preset, vary), asked, designs, reoptimize)
-    command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
-    if others := [item.text for item in asked if preset == "objective" or item.key != COORDINATES]:
-        only = "none" if preset == "objective" else f"only {COORDINATES}"
-        raise InputError(f"--vary {others[0]}: expected {only} with {command}")
-    if preset != "coordinates" and designs:
-        raise InputError(f"--design: expected none with {command}, which makes its own")
-    if reoptimize:
-        raise InputError(f"--reoptimize: not with {command}; see compare reductions")
-    if preset == "objective":
-        return objective_plan(scene, kinds)
-    counts = asked[0].whole_numbers if asked else None
-    if preset == "reduction":
-        return reduction_plan(scene, counts)
-    return coordinates_plan(scene, designs, counts)
 
 
 def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
@@ -282,10 +270,10 @@ def magnitudes(
 # -- sweeps: one value, a grid of two, or more beside one another ------------------------------
 
 
-def sweep_plan(
+def sweep_steps(
     scene: Scene, name: str, asked: Sequence[Vary], designs: Sequence[Path], reoptimize: bool
-) -> Plan:
-    """Plan one key, two in a grid, or more, each alone.
+) -> Steps[Study]:
+    """Return the steps of one key, two in a grid, or more, each alone.
 
     InputError where no given design fits the values, or they do nothing to it.
     """
@@ -306,13 +294,13 @@ def sweep_plan(
     grids = [asked] if len(asked) <= 2 else [[entry] for entry in asked]
     rows = [row for keys in grids for row in _sweep(scene, keys, given, reoptimize, not resized)]
     if len(grids) == 1:
-        return Plan(name, rows, partial(_sweep_report, keys=tuple(asked)))
+        return reported(name, rows, partial(_sweep_report, keys=tuple(asked)))
     rows += [
         ({"role": "base", "design": label},
          Case(scene, "simulate", design, f"{label}, as it is"))
         for label, design in given.items()
     ]  # fmt: skip
-    return Plan(name, rows, partial(_several, keys=tuple(asked)))
+    return reported(name, rows, partial(_several, keys=tuple(asked)))
 
 
 def _sweep(
@@ -440,8 +428,10 @@ def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
 # -- objectives ------------------------------------------------------------------------------
 
 
-def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
-    """Plan a design for every objective that the scene allows, or for some kinds, see `posed`.
+def objective_steps(scene: Scene, kinds: Sequence[str] = ()) -> Steps[Study]:
+    """Return the steps of designing for every objective that the scene allows, or for some kinds.
+
+    See `posed`.
 
     InputError where the scene cannot have one of these kinds.
     """
@@ -453,7 +443,7 @@ def objective_plan(scene: Scene, kinds: Sequence[str] = ()) -> Plan:
         except InputError:  # the scene excludes it, as passive ends do "nothing attached"
             continue
     report = partial(_objectives, weights=scene.objective.effort_weights)
-    return Plan("objective", [({}, case) for case in cases], report)
+    return reported("objective", [({}, case) for case in cases], report)
 
 
 def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
@@ -464,7 +454,6 @@ def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     by = 1.0 if weights is None else np.array(weights)
     table = frame.rename(columns={"label": "objective"}).assign(
         **{"effort [-]": [float(np.linalg.norm(force * by)) for force in forces]},
-        **{"mass [kg]": [sum(item.get("mass", none).values()) for item in result]},
     )
     columns = ["objective", *QUANTITIES, "at [s]", "settling [mm]", "stress [MPa]", "effort [-]",
                "mass [kg]", "grayness [-]", "iterations", "seconds", "ended by"]  # fmt: skip
@@ -477,14 +466,16 @@ def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
 # -- coordinates and reductions --------------------------------------------------------------
 
 
-def coordinates_plan(scene: Scene, designs: Sequence[Path], counts: Sequence[int] | None) -> Plan:
-    """Plan given designs, simulated with every method and number of coordinates."""
+def coordinates_steps(
+    scene: Scene, designs: Sequence[Path], counts: Sequence[int] | None
+) -> Steps[Study]:
+    """Return the steps of given designs, simulated with every method and number of coordinates."""
     rows: Rows = []
     scenes = reductions(scene, counts, SWEPT)
     for (label, design), other in product(given_designs(scene, designs).items(), scenes):
         case = Case(other, "simulate", design, f"{label}, {reduction_name(other)}")
         rows.append(({"design": label, **_reduction(other)}, case))
-    return Plan("coordinates", rows, _coordinates)
+    return reported("coordinates", rows, _coordinates)
 
 
 def _reduction(scene: Scene) -> dict[str, Any]:
@@ -503,8 +494,8 @@ def _coordinates(frame: pd.DataFrame) -> Report:
     return [table], [LineFigure("", title, panels)]
 
 
-def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
-    """Plan designs optimised with every reduction, simulated with the reference."""
+def reduction_steps(scene: Scene, counts: Sequence[int] | None) -> Steps[Study]:
+    """Return the steps of designs optimised with every reduction, simulated with the reference."""
     reference = reference_scene(scene)
     called = reduction_name(reference)
     rows: Rows = []
@@ -513,7 +504,7 @@ def reduction_plan(scene: Scene, counts: Sequence[int] | None) -> Plan:
         again = Case(reference, "simulate", optimised, f"{optimised.label} in {called}")
         rows += [(_reduction(other) | {"role": "own"}, optimised)]
         rows += [(_reduction(other) | {"role": "again"}, again)]
-    return Plan("reduction", rows, partial(_reductions, called=called))
+    return reported("reduction", rows, partial(_reductions, called=called))
 
 
 def _reductions(frame: pd.DataFrame, called: str) -> Report:

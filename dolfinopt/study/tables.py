@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import pandas as pd
 
-from dolfinopt.data import page_folders
+from dolfinopt.data import filled
 from dolfinopt.disk import write_text
 from dolfinopt.plots.panels import Panel
 from dolfinopt.scene.load import Scene
@@ -109,8 +109,8 @@ class Study:
     name: str  # of its files
     tables: tuple[Table, ...]  # the main one first
     figures: tuple[Figure, ...]
-    failures: tuple[str, ...]  # one line each
-    computed: int  # cases that were not there before
+    failures: tuple[str, ...] = ()  # one line each
+    computed: int = 0  # cases that were not there before
 
     def markdown(self) -> str:
         """Return all tables but the long ones."""
@@ -143,19 +143,8 @@ def joined(*parts: str) -> str:
 
 
 def html_page(template: str, **content: Any) -> str:
-    """Return a page from a template of `data.page_folders`; what it names must be given.
-
-    It is one file, its pictures inside, so that it opens anywhere.
-    """
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-    templates = Environment(
-        loader=FileSystemLoader(page_folders()),
-        autoescape=lambda name: str(name).endswith(".html"),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-    )
-    return templates.get_template(template).render(as_text=as_text, **content).lstrip()
+    """Return a page, see `data.filled`: one file, pictures inside, so that it opens anywhere."""
+    return filled(template, {}, as_text=as_text, **content).strip()
 
 
 def embedded(data: bytes) -> dict[str, Any]:

@@ -9,31 +9,27 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import combinations_with_replacement
 from pathlib import Path
-from types import UnionType
-from typing import Any, NamedTuple, Union, get_args, get_origin
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from numpy.polynomial import legendre
-from pydantic.fields import FieldInfo
 from scipy import stats
 from scipy.stats import qmc
 
 from dolfinopt.errors import InputError
-from dolfinopt.parallel import on_root
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.messages import allowed_words, field_at
+from dolfinopt.scene.messages import allowed_words, field_at, model_at
 from dolfinopt.scene.old_words import in_new_words
-from dolfinopt.scene.tables.base import without_none
-from dolfinopt.study.cases import SAMPLED, Case, Runner, scales_bodies, with_sample
+from dolfinopt.study.cases import SAMPLED, Case, Steps, scales_bodies, with_sample
 from dolfinopt.study.studies import (
     QUANTITIES,
     Design,
-    Plan,
     Report,
+    Rows,
     by_design,
-    carry_out,
     given_designs,
+    reported,
 )
 from dolfinopt.study.tables import Figure, FrameFigure, Study, Table, file_name
 from dolfinopt.study.variants import asked_by, axis_of, changed
@@ -343,37 +339,20 @@ def study_random(
     scene: Scene,
     random: Sequence[str],
     designs: Sequence[Path],
-    runner: Runner,
     samples: int = 1000,
     seed: int = 1,
-) -> Study:
-    """Simulate designs under random values of the scene (collective).
+) -> Steps[Study]:
+    """Return the steps of simulating designs under random values of the scene.
 
     Args:
         scene: with the nominal values; its scenarios are left out.
         random: texts "key.path=distribution", see `parse_distribution`.
-        designs, runner: see `studies.study`; InputError as there.
+        designs: see `studies.study`; InputError as there.
         samples: how many.
         seed: of what is random.
     """
-    plan = on_root(runner.world, _plan, scene, random, designs, samples, seed)
-    return carry_out(plan, runner)
-
-
-def random_name(random: Sequence[str]) -> str:
-    """Return the name of the files of a study: the keys that are random."""
-    return file_name("uncertainty", *(text.partition("=")[0].strip() for text in random))
-
-
-# -- what is asked ---------------------------------------------------------------------------
-
-
-def _plan(
-    scene: Scene, random: Sequence[str], designs: Sequence[Path], count: int, seed: int
-) -> Plan:
-    """Check what is asked and draw the samples (root only)."""
-    if count < LEAST:
-        raise InputError(f"--samples {count}: expected at least {LEAST}")
+    if samples < LEAST:
+        raise InputError(f"--samples {samples}: expected at least {LEAST}")
     if seed < 0:
         raise InputError(f"--seed {seed}: expected an integer >= 0")
     nominal = changed(scene, "scenarios=[]") if scene.scenarios else scene
@@ -381,16 +360,22 @@ def _plan(
     keys = [item.key for item in inputs]
     if twice := [key for key in keys if keys.count(key) > 1]:
         raise InputError(f"--random {twice[0]} twice; a value has one distribution")
-    values = draw([item.distribution for item in inputs], unit_points(count, len(inputs), seed))
-    samples = sample_texts(keys, values)
+    values = draw([item.distribution for item in inputs], unit_points(samples, len(inputs), seed))
+    texts = sample_texts(keys, values)
     for index in (*values.argmin(axis=0), *values.argmax(axis=0)):  # refused, it is so there mostly
-        with_sample(nominal, samples[1 + index], 1 + index)
-    rows = [
+        with_sample(nominal, texts[1 + index], 1 + index)
+    rows: Rows = [
         ({"design": label}, case)
         for label, design in given_designs(scene, designs).items()
-        for case in sample_cases(nominal, samples, label, design)
+        for case in sample_cases(nominal, texts, label, design)
     ]
-    return Plan(random_name(random), rows, partial(_report, inputs=inputs, values=values))
+    report = partial(_report, inputs=inputs, values=values)
+    return (yield from reported(random_name(random), rows, report))
+
+
+def random_name(random: Sequence[str]) -> str:
+    """Return the name of the files of a study: the keys that are random."""
+    return file_name("uncertainty", *(text.partition("=")[0].strip() for text in random))
 
 
 def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...]]:
@@ -434,11 +419,11 @@ def parse_input(scene: Scene, text: str) -> Input:
             raise InputError(f"no given design fits arms of another {parts[-1]}")
         if parts[-1].endswith("*"):
             return Input(key, 1.0, distribution.within(0.0, math.inf))
-        field = field_at((parts[0], parts[-1]))
+        loc = parts[0], parts[-1]
         try:
-            return Input(key, nominal_value(scene, key), distribution.within(*_range(field)))
+            return Input(key, nominal_value(scene, key), distribution.within(*_range(*loc)))
         except InputError as error:
-            words = allowed_words(field)
+            words = allowed_words(field_at(loc))
             raise InputError(f"{error}; {'.'.join(parts)} is {words}") from None
 
 
@@ -460,18 +445,14 @@ def nominal_value(scene: Scene, key: str) -> object:
     return values.pop() if len(values) == 1 else None
 
 
-def _range(field: FieldInfo) -> tuple[float, float]:
+def _range(table: str, name: str) -> tuple[float, float]:
     """Return the least and the largest value of a key, also of one that may be left out."""
-    kind = without_none(field.annotation)
-    if get_origin(kind) in (Union, UnionType):  # of arrays, too: the range of a number
-        kind = get_args(kind)[0]
-    inner = get_args(kind)[1:]
-    rules = [*field.metadata, *(rule for item in inner for rule in getattr(item, "metadata", ()))]
-    lows, highs = (
-        [getattr(rule, name) for rule in rules for name in names if hasattr(rule, name)]
-        for names in (("gt", "ge"), ("lt", "le"))
-    )
-    return max(lows, default=-math.inf), min(highs, default=math.inf)
+    model = model_at((table,))
+    assert model is not None
+    schema = model.model_json_schema()["properties"][name]
+    kind = schema.get("anyOf", [schema])[0]  # of arrays, too: the range of a number
+    low = kind.get("minimum", kind.get("exclusiveMinimum", -math.inf))
+    return low, kind.get("maximum", kind.get("exclusiveMaximum", math.inf))
 
 
 # -- what comes out --------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from dolfinopt.exchange.urdf import robot as urdf
 from dolfinopt.exchange.urdf.file import read_robot
 from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
 from dolfinopt.exchange.urdf.robot import scene_bodies
-from dolfinopt.exchange.urdf.scene import INERTIA, cells_of, scene_names
+from dolfinopt.exchange.urdf.scene import cells_of, scene_names
 from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.mesh.checks import check_cells
 from dolfinopt.mesh.solid_cells import TENSOR
@@ -40,7 +40,7 @@ def rigid(imported):
     bodies = scene_bodies(robot, links, urdf.default_tool(robot, links))
     names = scene_names(body.link for body in bodies)
     own = {names[body.link]: body.inertia for body in bodies if body.is_solid}
-    solids = {name: (one.mass, one.centre, np.array([one.tensor[i] for i in INERTIA]))
+    solids = {name: (one.mass, one.centre, one.moments)
               for name, one in own.items()}  # fmt: skip
     assert [arm["name"] for arm in tree_of(scene)["arms"]] == list(names.values())
     return robot, bodies, mechanism_of(scene, solids)

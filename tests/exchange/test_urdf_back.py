@@ -9,7 +9,7 @@ from pages import Reader
 from robots import DEMO, DEMO_MOTION, run_import, tree_of, write_uneven
 from runs import ROOT, refusal, run, summary_of
 
-from dolfinopt.cli.exchange import _check_robot
+from dolfinopt.cli.export import _check_robot
 from dolfinopt.exchange.urdf.file import NewLink, implausible_inertias, read_robot, robot_text
 from dolfinopt.exchange.urdf.robot import Inertia, default_tool, scene_bodies
 from dolfinopt.exchange.urdf.scene import read_origin

@@ -23,7 +23,6 @@ from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Arm
-from dolfinopt.study.cases import Runner
 from dolfinopt.study.sections import Members
 
 COMM = MPI.COMM_WORLD
@@ -219,7 +218,7 @@ def test_cantilever(kind, share, tmp_path):
            (("length", LENGTH), ("height", HEIGHT), ("thickness", THICKNESS))]  # fmt: skip
     keys = [*own, "simulation.stiffening=false"]
     scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", keys)
-    members = Members(scene, kind, MESHED.get(kind, SOLID_BAR), Runner(tmp_path, MPI.COMM_SELF))
+    members = Members(scene, kind, MESHED.get(kind, SOLID_BAR), tmp_path)
     made = members.case((share, share)).scene
     _, arms, x_phys = arms_with_design(MPI.COMM_SELF, made, None, Profile())
     body = arms[1].reduce(x_phys[1])

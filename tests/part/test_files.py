@@ -199,7 +199,7 @@ def test_parts_of_another_design(tmp_path, capsys):
     run("part", folder, *PLAIN, "--out", other)
     (folder / "part" / "note.txt").write_text("mine")
     assert stale_parts(folder / "part") == stale_parts(other) == ""
-    assert remove_stale_parts(folder) == ""
+    assert remove_stale_parts(folder, folder / "design.npz") == ""
     with np.load(folder / "design.npz") as data:
         arrays = {key: 0.5 * value if "density" in key else value for key, value in data.items()}
     np.savez(folder / "design.npz", **arrays)

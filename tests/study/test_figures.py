@@ -11,21 +11,21 @@ from pictures import TOLERANCE, difference
 
 from dolfinopt.plots.panels import Line, Panel
 from dolfinopt.plots.style import looks
-from dolfinopt.study.figures import line_figure
+from dolfinopt.study.figures import draw
 from dolfinopt.study.tables import LineFigure, Table
 
 PICTURE = Path(__file__).parent / "sweep.png"  # written by `bare`, then looked at
 pytestmark = pytest.mark.serial  # one rank shows all there is
 
 
-def test_line_figure():
+def test_draw():
     """Axes with units, a legend each; equal names look alike; steep curves on a log scale."""
     x = np.arange(4.0)
     panels = (
         Panel("one", "mass [kg]", "compliance [N m]", (Line("a", x, x + 1.0), Line("b", x, x))),
         Panel("two", "mass [kg]", "deviation [mm]", (Line("b", x, 10.0**x),)),
     )
-    drawn = line_figure(LineFigure("", "Title", panels))
+    drawn = draw(LineFigure("", "Title", panels))
     first, second = drawn.axes
     assert [axes.get_xlabel() for axes in drawn.axes] == ["mass [kg]"] * 2
     assert [axes.get_ylabel() for axes in drawn.axes] == ["compliance [N m]", "deviation [mm]"]
@@ -33,7 +33,7 @@ def test_line_figure():
     np.testing.assert_array_equal(first.lines[0].get_ydata(), x + 1.0)
     assert first.lines[1].get_color() == second.lines[0].get_color() != first.lines[0].get_color()
     memory = Panel("", "n [-]", "memory [MB]", (Line("a", 10.0**x, 100.0 * (x + 1.0)),), log=True)
-    (axes,) = line_figure(LineFigure("", "", (memory,))).axes
+    (axes,) = draw(LineFigure("", "", (memory,))).axes
     assert axes.get_xscale() == axes.get_yscale() == "log"
     assert 10.0 < axes.get_ylim()[0] < 100.0 and 400.0 < axes.get_ylim()[1] < 1000.0
 
@@ -47,7 +47,7 @@ def sweep_figure(factor=1.0):
         for what, power in (("compliance [N m]", 2.0), ("maximal deviation [mm]", 1.0)):
             lines = (Line(name, mass, designs[name] * mass**power) for name in names)
             panels.append(Panel("", "payload.mass [kg]", what, tuple(lines)))
-    drawn = line_figure(LineFigure("", "Designs by payload.mass [kg].", tuple(panels)))
+    drawn = draw(LineFigure("", "Designs by payload.mass [kg].", tuple(panels)))
     for axes in drawn.axes:
         if legend := axes.get_legend():
             legend.remove()  # words

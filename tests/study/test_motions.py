@@ -10,6 +10,7 @@ from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.scene.csv_table import read_table
 from dolfinopt.study.cases import Runner
 from dolfinopt.study.motions import RIGID, SHAPERS, study_motions
+from dolfinopt.study.studies import carry_out
 
 QUICK = ("arms.cells=[20,3]", "design.filter_radius=0", "simulation.tolerance=1e-3",
          "optimizer.max_iterations=1", "motion.horizon=2.3")  # fmt: skip
@@ -20,7 +21,8 @@ def found(tmp_path_factory):
     """The study of two small arms, and its folder."""
     folder = tmp_path_factory.mktemp("motions")
     scene = do.load_scene(ROOT / "demos" / "two_arm.toml", QUICK)
-    return study_motions(scene, (), Runner(folder, MPI.COMM_SELF, False)), folder, scene
+    runner = Runner(folder, MPI.COMM_SELF, False)
+    return carry_out(study_motions(scene, (), folder), runner), folder, scene
 
 
 @pytest.mark.serial
@@ -76,6 +78,4 @@ def test_vibration_is_the_first_frequency_of_the_machine():
 
 def test_refused(tmp_path):
     pinned = do.load_scene(ROOT / "demos" / "four_bar.toml")
-    refusal(
-        lambda: study_motions(pinned, (), Runner(tmp_path, MPI.COMM_WORLD)), "feed_forward.kind"
-    )
+    refusal(lambda: next(study_motions(pinned, (), tmp_path)), "feed_forward.kind")

@@ -55,23 +55,26 @@ class Found:
 
 def search(members, values):
     """Run the search on a function of the shares; return its answer and all that it asked."""
-    asked = []
+    asked, done, steps = [], None, lightest(members)
+    while True:
+        try:
+            wanted = steps.send(done)
+        except StopIteration as end:
+            return end.value, asked
+        asked += wanted
+        done = {shares: values(shares) for shares in wanted}
 
-    def simulate(wanted):
-        asked.extend(wanted)
-        return [values(shares) for shares in wanted]
 
-    return lightest(members, simulate), asked
+class Bars(Members):
+    """Members whose cases are their shares alone."""
+
+    def case(self, shares):
+        return shares
 
 
 @pytest.fixture(scope="module")
 def bars(tmp_path_factory):
-    return Members(
-        do.load_scene(TWO_ARM),
-        "solid bar",
-        FLAT_BAR,
-        Runner(tmp_path_factory.mktemp("m"), MPI.COMM_SELF),
-    )
+    return Bars(do.load_scene(TWO_ARM), "solid bar", FLAT_BAR, tmp_path_factory.mktemp("m"))
 
 
 @pytest.mark.parametrize("share", [0.013, 0.11, 0.6, 0.99])
@@ -210,9 +213,8 @@ def test_tubes_in_space(tmp_path, capsys):
     deviation = dict(zip(kinds, column(rows, "maximal deviation [mm]"), strict=True))
     assert deviation["rectangular tube"] < 0.5 * deviation["solid bar"]
     assert "the rectangular tube wins" in capsys.readouterr().out
-    bar, tube, *_, walls = ahead(
-        do.load_scene(SPATIAL, scene[1::2]), Runner(tmp_path / "a", MPI.COMM_SELF)
-    )
+    runner = Runner(tmp_path / "a", MPI.COMM_SELF)
+    bar, tube, *_, walls = runner.follow(ahead(do.load_scene(SPATIAL, scene[1::2]), runner.folder))
     value = [float(line.split("load cases ")[1].split()[0]) for line in (bar, tube)]
     assert value[1] < 0.5 * value[0] and "hollow" in walls
     assert (tmp_path / "sections_deviation.png").exists()
@@ -220,14 +222,14 @@ def test_tubes_in_space(tmp_path, capsys):
 
 def test_a_bar_takes_the_place_of_a_mesh_file(tmp_path):
     """Straight from axis to axis, in cells of about the height's; the file's groups are gone."""
-    meshed, here = do.load_scene(ROOT / "demos" / "two_arm_bores.toml"), Runner(tmp_path, WORLD)
-    made = Members(meshed, "solid bar", FLAT_BAR, here).case((0.5, 0.25)).scene
+    meshed = do.load_scene(ROOT / "demos" / "two_arm_bores.toml")
+    made = Members(meshed, "solid bar", FLAT_BAR, tmp_path).case((0.5, 0.25)).scene
     for arm, old, share in zip(made.arms, meshed.arms, (0.5, 0.25), strict=True):
         assert arm.mesh is None and arm.length == old.length and len(arm.cells) == 2
         assert arm.height == pytest.approx(share * old.height, rel=1e-12)
     assert made.design.is_solid
     solid = do.load_scene(SPATIAL)
-    made = Members(solid, "solid bar", SOLID_BAR, here).case((0.5, 0.5)).scene
+    made = Members(solid, "solid bar", SOLID_BAR, tmp_path).case((0.5, 0.5)).scene
     assert made.arms[1].cells == solid.arms[1].cells
     assert (made.arms[1].height, made.arms[1].thickness) == pytest.approx((0.02, 0.01), rel=1e-12)
 
@@ -245,8 +247,8 @@ def test_arms_that_no_member_replaces(shared_tmp_path):
         ((column, *rigid), ("expected arms with a design",)),
     ):
         changed = scene.unchecked_copy({"arms": arms})
-        refusal(lambda: study_sections(changed, (), runner), *words)  # noqa: B023
-        assert ahead(changed, runner) == []
+        refusal(lambda: next(study_sections(changed, (), runner.folder)), *words)  # noqa: B023
+        assert runner.follow(ahead(changed, runner.folder)) == []
     assert not (shared_tmp_path / "o").exists()
 
 

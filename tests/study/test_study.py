@@ -170,9 +170,8 @@ def test_payload(folder, capsys):
 @alone
 def test_cross_evaluation(folder):
     """The matrix holds design i in scenario j, the losses follow from it."""
-    done = study.study(
-        scene(), "payload", ["payload.mass=8,4"], [], Runner(folder, WORLD, False), reoptimize=True
-    )
+    steps = study.study(scene(), "payload", ["payload.mass=8,4"], [], reoptimize=True)
+    done = study.carry_out(steps, Runner(folder, WORLD, False))
     tables = {table.name: table for table in done.tables}
     values = np.array([row[1:] for row in cells_of(tables["cross_compliance"])])
     loss = np.array([row[1:] for row in cells_of(tables["cross_compliance_loss"])])
@@ -191,8 +190,10 @@ def test_cross_evaluation(folder):
 @pytest.mark.skipif(WORLD.size == 1, reason="compares one rank with several")
 def test_ranks_do_not_matter(tmp_path, shared_tmp_path):
     vary, base = ["payload.mass=4:8:3", "motion.flattening=0.8,1"], scene()
-    single = study.study(base, None, vary, [], Runner(tmp_path, SELF, shown=False))
-    together = study.study(base, None, vary, [], Runner(shared_tmp_path / "all", WORLD, False))
+    own, all_ranks = Runner(tmp_path, SELF, False), Runner(shared_tmp_path / "all", WORLD, False)
+    single, together = (
+        study.carry_out(study.study(base, None, vary, []), runner) for runner in (own, all_ranks)
+    )
     for one, other in zip(single.tables, together.tables, strict=True):
         assert (one.name, one.title) == (other.name, other.title)
         pd.testing.assert_frame_equal(one.frame, other.frame, check_exact=True)
@@ -202,7 +203,8 @@ def test_ranks_do_not_matter(tmp_path, shared_tmp_path):
 def test_grid_of_two(folder):
     vary = ["payload.mass=4,8", "damping.stiffness_proportional=1e-4,2e-4,4e-4"]
     design = write_uniform(folder / "given.npz", (12, 3), 0.8)
-    done = study.study(scene(), None, vary, [design], Runner(folder, WORLD, shown=False))
+    steps = study.study(scene(), None, vary, [design])
+    done = study.carry_out(steps, Runner(folder, WORLD, shown=False))
     [table], [figure] = done.tables, done.figures
     assert [row[:2] for row in cells_of(table)] == [
         (m, d) for m in (4.0, 8.0) for d in (1e-4, 2e-4, 4e-4)
@@ -218,7 +220,8 @@ def test_grid_of_two(folder):
 @alone
 def test_three_keys_one_at_a_time(folder):
     vary = ["payload.mass=5,7", "motion.flattening=0.9,1", "material.density=2600,2800"]
-    done = study.study(scene(), None, vary, [], Runner(folder, WORLD, shown=False))
+    steps = study.study(scene(), None, vary, [])
+    done = study.carry_out(steps, Runner(folder, WORLD, shown=False))
     assert [table.name for table in done.tables] == ["", *(text.split("=")[0] for text in vary)]
     bars = cells_of(done.tables[0])[: len(vary)]
     changes = {bar[2].split()[0]: bar[3:] for bar in bars}
@@ -304,9 +307,9 @@ def test_objective(folder):
 
 def test_what_comparisons_and_studies_plan():
     """Solid ends allow "nothing attached"; few directions are not asked of the Gramian."""
-    plan = study.objective_plan(scene("arms.passive=0.05"))
+    cases = next(study.objective_steps(scene("arms.passive=0.05")))
     every = (*variants.OBJECTIVES, *variants.RESPONSES[:2])
-    assert [c.label for _, c in plan.rows] == ["initial design", *(label for label, _ in every)]
+    assert [case.label for case in cases] == ["initial design", *(label for label, _ in every)]
     # The drives' effort takes as much material as its limits ask for.
     limited = scene("constraints.compliance=30")
     assert variants.posed(limited, "effort").design.volume_fraction == 1.0

@@ -12,6 +12,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.study import cases as computing
 from dolfinopt.study import uncertainty
 from dolfinopt.study.cases import Runner, run_cases, scales_bodies, with_sample
+from dolfinopt.study.studies import carry_out
 from dolfinopt.study.uncertainty import (
     nominal_value,
     parse_input,
@@ -212,7 +213,8 @@ def test_command(folder, capsys):
 
 def study(given, folder, *random, base=None, **options):
     base = scene() if base is None else base
-    return study_random(base, random, [given], Runner(folder, WORLD, False), **options)
+    steps = study_random(base, random, [given], **options)
+    return carry_out(steps, Runner(folder, WORLD, False))
 
 
 def tables_of(done):

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
@@ -34,6 +35,7 @@ from dolfinopt.scene.toml import read_toml
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
+Point = tuple[float, float, float]
 MOVABLE = ("revolute", "continuous", "prismatic")
 
 
@@ -95,6 +97,11 @@ class Inertia:
     mass: float
     centre: np.ndarray
     tensor: np.ndarray
+
+    @property
+    def moments(self) -> np.ndarray:
+        """Components xx, yy, zz, xy, xz, yz of the tensor (6,), kg m2."""
+        return self.tensor[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
 
     def posed(self, pose: np.ndarray) -> Inertia:
         """Return it in the components of the outer frame of `pose`."""
@@ -217,7 +224,7 @@ def inverse(pose: np.ndarray) -> np.ndarray:
 
 
 def roll_pitch_yaw_of(R: np.ndarray) -> tuple[float, float, float]:
-    """Return URDF's fixed-axis roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll).
+    """Return URDF's fixed-axis roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll), or of a pose.
 
     Roll and pitch are taken from Rz(-yaw) R, so that R comes back to rounding for any yaw, also
     where a pitch of a quarter turn leaves yaw to chance.
@@ -488,13 +495,25 @@ SAME_PLACE = 1e-6  # m: a solid has an interface at a point no farther from it
 OWN = ("links", "points")
 
 
+class RobotClosure(BaseModel):
+    """What a table of closed loops states of a joint; descriptions are what is expected."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str = Field(description="a word")
+    kind: str = Field(description="a word")
+    links: tuple[str, str] = Field(description='a link, then another or "ground"')
+    points: tuple[Point, Point] = Field(description="two points, in the links' frames [m]")
+    rpy: Point = Field((0.0, 0.0, 0.0), description="three numbers [rad]")
+
+
 @dataclass(frozen=True, eq=False)
 class RobotLoops:
     """What a scene of a robot has of closed loops.
 
     Attributes:
         passive: names of the joints that follow, in the robot.
-        closures: keys and values of every closure; `between` names links.
+        closures: keys and values of every closure; `between`, links and what follows their names.
         interfaces: of bodies by their link, (name, point in the body's frame).
         rods: names of those rods whose length is a column of the table.
     """
@@ -554,25 +573,21 @@ class _Reader:
 
     def closure(self, key: str, table: Any) -> tuple[dict[str, Any], tuple[str, np.ndarray] | None]:
         """Return a closure's keys, and the interface (link of the body, point) that it needs."""
-        if not isinstance(table, dict):
-            raise _refused(self.file, key, table, "expected a table [[closures]]")
-        for name in ("name", "kind"):
-            if not isinstance(table.get(name), str):
-                raise _refused(self.file, f"{key}.{name}", table.get(name), "expected a word")
-        links: Any = table.get("links")
-        points: Any = table.get("points")
-        if not _is_list(links, 2, str) or links[0] == GROUND:
-            expected = 'expected a link, then another or "ground"'
-            raise _refused(self.file, f"{key}.links", links, expected)
-        if not (_is_list(points, 2, list) and all(_is_list(p, 3, int | float) for p in points)):
-            expected = "expected two points, in the links' frames [m]"
-            raise _refused(self.file, f"{key}.points", points, expected)
+        try:
+            stated = RobotClosure.model_validate(table)
+        except ValidationError as error:
+            where, expected = key, "a table [[closures]]"
+            for name in error.errors()[0]["loc"][:1]:  # none where it is no table
+                where, table = f"{key}.{name}", table.get(name)
+                expected = str(RobotClosure.model_fields[str(name)].description)
+            raise _refused(self.file, where, table, f"expected {expected}") from None
+        links = list(stated.links)
         keys = {name: value for name, value in table.items() if name not in OWN}
-        ends = zip(links, points, strict=True)
+        ends = zip(links, stated.points, strict=True)
         (body, first), (other, second) = (self._place(f"{key}.links", *end) for end in ends)
         if body == GROUND:
             raise _refused(self.file, f"{key}.links", links, "expected a link that moves first")
-        if table["kind"] not in ("ball", "rod") and not np.allclose(first[:3, :3], np.eye(3)):
+        if stated.kind not in ("ball", "rod") and not np.allclose(first[:3, :3], np.eye(3)):
             raise _refused(
                 self.file,
                 f"{key}.links",
@@ -580,18 +595,13 @@ class _Reader:
                 f"{links[0]} is turned against {body}, to which it is fixed: name {body}",
             )
         keys["point"] = second[:3, 3].tolist()
-        if table["kind"] != "rod":
-            keys["rpy"] = self._turned(key, table.get("rpy", [0.0] * 3), second[:3, :3])
-        keys["between"], interface = [body, other], None
+        if stated.kind != "rod":
+            turn = Rotation.from_euler("xyz", stated.rpy).as_matrix()
+            keys["rpy"] = list(roll_pitch_yaw_of(second[:3, :3] @ turn))
+        keys["between"], interface = [(body, ""), (other, "")], None
         if not self.bodies[body].is_solid and np.linalg.norm(first[:3, 3]) > SAME_PLACE:
-            keys["between"][0], interface = f"{body}.{table['name']}", (body, first[:3, 3])
+            keys["between"][0], interface = (body, f".{stated.name}"), (body, first[:3, 3])
         return keys, interface
-
-    def _turned(self, key: str, rpy: Any, R: np.ndarray) -> list[float]:
-        """Return roll, pitch and yaw of a joint's frame in that of the second body."""
-        if not _is_list(rpy, 3, int | float):
-            raise _refused(self.file, f"{key}.rpy", rpy, "expected three numbers [rad]")
-        return list(roll_pitch_yaw_of(R @ Rotation.from_euler("xyz", rpy).as_matrix()))
 
     def _place(self, key: str, link: str, point: Sequence[float]) -> tuple[str, np.ndarray]:
         """Return the body's link, or the ground, and a point's pose in its outboard frame."""
@@ -615,12 +625,6 @@ class _Reader:
                 "interface; give the scene more by hand, [[arms.interfaces]]",
             )
         return body, result
-
-
-def _is_list(value: Any, count: int, kind: Any) -> bool:
-    return (
-        isinstance(value, list) and len(value) == count and all(isinstance(x, kind) for x in value)
-    )
 
 
 def _refused(file: Path, key: str, value: Any, reason: str) -> InputError:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from dolfinopt.data import filled
 from dolfinopt.errors import InputError
-from dolfinopt.exchange.standard_input import INERTIA
 from dolfinopt.exchange.urdf.file import implausible_inertias
 from dolfinopt.exchange.urdf.robot import (
     CELLS,
@@ -28,7 +28,6 @@ from dolfinopt.exchange.urdf.robot import (
     SceneBody,
     SolidMesh,
     default_tool,
-    number,
     places_of,
     read_loops,
     roll_pitch_yaw_of,
@@ -108,57 +107,34 @@ class RobotScene:
 
     def text(self) -> str:
         """Return the scene as TOML with comments."""
-        lines = [
-            "#:schema ./dolfinopt.schema.json",
-            f"# {_one_line(self.robot.name)}, from {_one_line(self.robot.file.name)}.",
-            "# Frames as in URDF: origin (m) and rpy (rad) of a joint in its parent's outboard",
-            "# interface frame, axis in the joint's frame, which is the child's.",
-            "# What is left out has its default: `dolfinopt keys` lists all keys.",
-            "",
-            f"name = {_string(self.robot.name)}",
-            f"material = {_string(MATERIAL)}  # of the solid links; `dolfinopt keys material`",
-        ]
-        for body in self.bodies:
-            lines += ["", *(self._solid(body) if body.is_solid else self._rigid(body))]
-        for body in self.bodies:
-            lines += ["", *self._joint(body)]
-        for closure in self.loops.closures:
-            lines += ["", *self._closure(closure)]
-        lines += ["", *self._rest()]
-        return "\n".join(lines) + "\n"
-
-    def _solid(self, body: SceneBody) -> list[str]:
-        own, file = body.inertia, _one_line(self.robot.file.name)
-        extent = _extent(body)
-        if body.mesh is None:
-            guess = "a guess: its geometry does not tell"
-            by = f"{'the extents of its geometry' if body.measured else guess}: edit them"
-            keys = [f"cells = {list(cells_of(body.length, *extent.sides))}"]
-        else:
-            by = "those of its geometry"
-            keys = [
-                f"mesh = {_string(self.mesh_name(body))}  # {body.mesh.cells} cells, its geometry",
-                'cell_shape = "hexahedron"',
-            ]
-            if body.mesh.done:
-                keys.insert(0, f"# {'; '.join(body.mesh.done)}")
-            if body.mesh.offset > CENTRED * max(extent.sides):
-                keys.append(
-                    f"interface_offset = {number(_up(1.001 * body.mesh.offset))}  # m, of their "
-                    "middles from the joints"
-                )
-        return [
-            "[[arms]]",
-            f"name = {_string(self.arms[body.link])}",
-            f"length = {number(body.length)}  # m, from joint to joint",
-            f"height = {number(extent.sides[0])}  # m, {by}",
-            f"thickness = {number(extent.sides[1])}",
-            *keys,
-            f"passive = {number(extent.passive)}  # m, kept solid at the joints: one layer of "
-            f"cells, {DENSITY * extent.ends:.3g} kg",
-            f"# all solid it weighs {DENSITY * extent.volume:.4g} kg; {file}: "
-            f"{own.mass:.4g} kg, centre {_rounded(own.centre)}",
-        ]
+        solids = [body for body in self.bodies if body.is_solid]
+        extents = {body.link: _extent(body) for body in solids}
+        start = dict(zip((joint.name for joint in self.robot.movable), self.start_joints))
+        return filled(
+            "robot.toml.jinja",
+            {
+                "toml": _toml,
+                "value": toml_value,
+                "tidy": _tidy,
+                "up": _up,
+                "line": _one_line,
+                "rounded": _rounded,
+            },
+            scene=self,
+            arms=self.arms | {GROUND: GROUND},
+            extents=extents,
+            cells_of=cells_of,
+            rpy=roll_pitch_yaw_of,
+            inf=math.inf,
+            material=MATERIAL,
+            density=DENSITY,
+            centred=CENTRED,
+            trajectory=TRAJECTORY,
+            horizon=self.duration * (1.0 + SETTLING),
+            radius=RADIUS * max(extent.cell for extent in extents.values()),
+            weighed=all(body.inertia.mass > 0.0 for body in solids),
+            initial_joints=[start.get(body.joint.name) for body in self.bodies if body.joint.moves],
+        )
 
     @cached_property
     def start(self) -> tuple[float, float]:
@@ -186,106 +162,6 @@ class RobotScene:
     def mesh_name(self, body: SceneBody) -> str:
         """Return the name of a solid's mesh file."""
         return f"{self.arms[body.link]}.msh"
-
-    def _rigid(self, body: SceneBody) -> list[str]:
-        own = body.inertia
-        also = [name for name in body.links if name != body.link]
-        return [
-            "[[arms]]",
-            f"name = {_string(self.arms[body.link])}",
-            *([f"# with {', '.join(map(_one_line, also))}, fixed to it"] if also else []),
-            "rigid = true",
-            "length = 0.0",
-            f"mass = {number(own.mass)}",
-            f"centre = {_list(own.centre)}",
-            f"inertia = {_list(own.tensor[i] for i in INERTIA)}",
-            *self._interfaces(body),
-        ]
-
-    def _interfaces(self, body: SceneBody) -> list[str]:
-        lines = []
-        for name, point in (self.loops.interfaces or {}).get(body.link, ()):
-            lines += ["[[arms.interfaces]]", f"name = {_string(name)}"]
-            lines.append(f"point = {_list(_tidy(point))}")
-        return lines
-
-    def _closure(self, closure: Mapping[str, Any]) -> list[str]:
-        """Return a closure with arms in place of links."""
-        ends = []
-        for end in closure["between"]:
-            link = max((k for k in (*self.arms, GROUND) if f"{end}.".startswith(f"{k}.")), key=len)
-            ends.append((GROUND if link == GROUND else self.arms[link]) + end[len(link) :])
-        values = {**closure, "between": ends}
-        return ["[[closures]]", *(f"{key} = {toml_value(value)}" for key, value in values.items())]
-
-    def _joint(self, body: SceneBody) -> list[str]:
-        joint = body.joint
-        kind = "revolute" if joint.kind == "continuous" else joint.kind
-        parent = GROUND if body.parent == GROUND else self.arms[body.parent]
-        rpy = np.array(roll_pitch_yaw_of(body.pose[:3, :3]))
-        lines = [
-            "[[joints]]",
-            f"name = {_string(self.joints[joint.name])}",
-            f"type = {_string(kind)}",
-            f"parent = {_string(parent)}",
-            f"child = {_string(self.arms[body.link])}",
-            f"origin = {_list(_tidy(body.pose[:3, 3]))}",
-            f"rpy = {_list(_tidy(rpy))}",
-        ]
-        if not joint.moves:
-            return lines
-        lines.append(f"axis = {_list(_tidy(body.axis))}")
-        if joint.name in self.loops.passive:
-            lines.append("passive = true")
-        length, force = ("m", "N") if joint.kind == "prismatic" else ("rad", "N m")
-        if math.isfinite(joint.lower) and math.isfinite(joint.upper):
-            lines.append(f"position_limits = {_list((joint.lower, joint.upper))}  # {length}")
-        if math.isfinite(joint.velocity):
-            lines.append(f"velocity_limit = {number(joint.velocity)}  # {length}/s")
-        if math.isfinite(joint.effort):
-            lines.append(f"effort_limit = {number(joint.effort)}  # {force}")
-        if any(joint.friction):
-            lines.append(f"friction = {_list(joint.friction)}  # {force} s/{length}, {force}")
-        return lines
-
-    def _rest(self) -> list[str]:
-        """Return motion, payload and what of the defaults is not for a solid of this size."""
-        side = max(_extent(body).cell for body in self.bodies if body.is_solid)
-        fraction, initial = self.start
-        weighed = all(body.inertia.mass > 0.0 for body in self.bodies if body.is_solid)
-        return [
-            "[motion]",
-            'path = "joints"',
-            f"file = {_string(TRAJECTORY)}  # t in s, the joints in rad or m",
-            f"horizon = {number(_up(self.duration * (1.0 + SETTLING)))}  # s simulated",
-            *self._assembly(),
-            "gravity = [0.0, 0.0, -9.81]  # m/s2, in the robot's root frame",
-            "",
-            "[payload]",
-            "mass = 0.0  # kg, what the tool carries",
-            "",
-            "[damping]",
-            "stiffness_proportional = 1e-4  # s",
-            "",
-            "[reduction]",
-            "coordinates = 6  # of a solid link: those of its outboard interface alone",
-            "",
-            "[design]",
-            f"volume_fraction = {number(fraction)}  # of each solid link may stay: together as "
-            "heavy as in the URDF file" + ("" if weighed else ", as far as it tells"),
-            f"initial = {number(initial)}  # density with which they begin so",
-            f"filter_radius = {number(_up(RADIUS * side))}  # m",
-        ]
-
-    def _assembly(self) -> list[str]:
-        """Return where the loops' assembly begins, the joints in the scene's order."""
-        if not self.loops.closures:
-            return []
-        start = dict(
-            zip((joint.name for joint in self.robot.movable), self.start_joints, strict=True)
-        )
-        order = [body.joint.name for body in self.bodies if body.joint.moves]
-        return [f"initial_joints = {_list(start[name] for name in order)}  # near the way it is"]
 
     def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[Path, str | bytes]:
         """Return all files of a folder, the scene last: where it is, the others are.
@@ -404,12 +280,9 @@ def _rounded(values: Sequence[float] | np.ndarray) -> str:
     return "[" + ", ".join(f"{float(item):.4g}" for item in _tidy(np.asarray(values))) + "]"
 
 
-def _list(values: Iterable[float]) -> str:
-    return "[" + ", ".join(map(number, values)) + "]"
-
-
-def _string(text: str) -> str:
-    return json.dumps(_one_line(text), ensure_ascii=False)
+def _toml(value: Any) -> str:
+    """Return a text on one line, or numbers, zero without a sign, as TOML."""
+    return toml_value(_one_line(value) if isinstance(value, str) else np.asarray(value) + 0)
 
 
 def _one_line(text: str) -> str:

@@ -14,6 +14,7 @@ from pydantic.fields import FieldInfo
 from dolfinopt.scene.tables.base import (
     NAMES_FILE,
     ByDimension,
+    Extent,
     FileName,
     Inertia,
     Length,
@@ -21,7 +22,6 @@ from dolfinopt.scene.tables.base import (
     Position,
     Refusal,
     Six,
-    Table,
     Three,
     TwoOrThree,
     Use,
@@ -32,23 +32,13 @@ from dolfinopt.scene.tables.base import (
 from dolfinopt.scene.tables.design import Region, check_regions
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
-    FRICTION_SPEED,
     OF_PARTS,
-    BearingDamping,
-    BearingStiffness,
-    Friction,
-    FrictionSpeed,
-    GearDamping,
-    GearRatio,
-    GearStiffness,
+    Drive,
     Interface,
     Point,
-    RotorInertia,
     check_bores,
-    check_dampers,
     check_interfaces,
     check_motor,
-    check_plane_bearing,
     in_frame,
 )
 from dolfinopt.scene.tables.material import (
@@ -116,7 +106,6 @@ WALL_KEYS = ("wall", "min_wall", "max_wall", "ribs")
 RIB_LENGTH, RIB_PITCH = 2, 4  # cells along a hollow arm: of a rib; from one to the next at least
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
-ArmLength = Annotated[float, Field(ge=0, le=1e4)]  # m
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 MAX_ARMS = 1000  # every arm is checked beside all others
 PART_FILES = ("_face", "_r12")  # behind an arm's name in files of its part
@@ -153,7 +142,7 @@ def check_arm_name(name: str) -> str:
     return name
 
 
-class Arm(Table):
+class Arm(Drive):
     """One flexible arm; a key left out in a scene is taken from the arm before."""
 
     USES = (
@@ -167,7 +156,7 @@ class Arm(Table):
     name: Annotated[str, AfterValidator(check_arm_name)] = setting(
         "unique name, used in files and messages [-]"
     )
-    length: ArmLength = setting(
+    length: Extent = setting(
         "distance from the inboard joint axis to the outboard one, or to the "
         "end-effector; 0 only of a rigid arm in space [m]"
     )
@@ -210,12 +199,11 @@ class Arm(Table):
         'finite element: "incompatible" are quadrilaterals and hexahedra that bend '
         "without locking; default: these, quadratic triangles and tetrahedra [-]",
     )
-    passive: float | None = setting(
+    passive: Extent | None = setting(
         None,
         "length kept solid around both interfaces; default: a quarter of the "
         "height, at most a tenth of the length; with a mesh file 0, its own groups "
         "[m]",
-        ge=0,
     )
     symmetric: bool | Literal["z", "yz"] = setting(
         False,
@@ -255,11 +243,9 @@ class Arm(Table):
         "cell [-]",
     )
     rigid: bool = setting(False, "a rigid bar of solid material, not optimised [-]")
-    mass: float | None = setting(
+    mass: Inertia | None = setting(
         None,
         "mass of a rigid arm, its centre halfway; default: that of the solid bar [kg]",
-        ge=0,
-        le=1e9,
     )
     inertia: Inertia | Tensor | None = setting(
         None,
@@ -269,20 +255,10 @@ class Arm(Table):
     centre: Three[Position] | None = setting(
         None, "centre of mass of a rigid arm in space, in the arm's frame; default: halfway [m]"
     )
-    joint_mass: float = setting(
-        0.0, "mass at the outboard interface: motor, gearbox, bearing [kg]", ge=0, le=1e6
+    joint_mass: Inertia = setting(
+        0.0, "mass at the outboard interface: motor, gearbox, bearing [kg]"
     )
-    joint_inertia: float = setting(
-        0.0, "moment of inertia at the outboard interface [kg m2]", ge=0, le=1e6
-    )
-    rotor_inertia: RotorInertia = 0.0
-    gear_ratio: GearRatio = None
-    gear_stiffness: GearStiffness = 0.0
-    gear_damping: GearDamping = 0.0
-    bearing_stiffness: BearingStiffness = None
-    bearing_damping: BearingDamping = None
-    friction: Friction = None
-    friction_speed: FrictionSpeed = FRICTION_SPEED
+    joint_inertia: Inertia = setting(0.0, "moment of inertia at the outboard interface [kg m2]")
     sid: FileName | None = setting(
         None, "standard input data file (SID) in place of a geometry [-]"
     )
@@ -306,7 +282,7 @@ class Arm(Table):
         self._check_kind()
         self._check_thickness()
         self._check_hollow()
-        check_dampers(self)
+        super().check_table()
         self._check_ends()
         self._check_mesh()
 
@@ -690,7 +666,7 @@ class Arm(Table):
         before = scene.arms[: at[-1]]
         if not scene.is_spatial:
             self._check_files(before)
-            check_plane_bearing(self)
+            self.check_plane_bearing()
         if self.is_solid and self.flexible and not scene.is_spatial:
             raise Refusal(
                 "expected two integers (along, across) of an arm in plane stress: a solid arm "

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 # Ranges far beyond what machines need, within which products and quotients of all quantities stay
 # within double precision. What is merely improbable is for `plausibility.py` to say.
 Length = Annotated[float, Field(ge=1e-6, le=1e4)]  # m
+Extent = Annotated[float, Field(ge=0, le=1e4)]  # m; 0: none
 Position = Annotated[float, Field(ge=-1e4, le=1e4)]  # m; rad, m of a joint's coordinate
 Angle = Annotated[float, Field(ge=-1e3, le=1e3)]  # rad
 Duration = Annotated[float, Field(ge=1e-4, le=1e5)]  # s
@@ -146,7 +147,9 @@ class Table(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Tell in the descriptions of keys what they are used with."""
+        """Put inherited keys behind a table's own; tell what keys are used with."""
+        for key in [key for key in cls.model_fields if key not in cls.__annotations__]:
+            cls.model_fields[key] = cls.model_fields.pop(key)
         for use in cls.USES:
             for key in use.keys.split():
                 field = cls.model_fields[key]

@@ -98,9 +98,7 @@ class Closures(Table):
         "of a rod; default: it is driven, its length a column of the motion's table, "
         "or what the path asks for [m]",
     )
-    stiffness: float = setting(
-        0.0, "of a rod that is a spring; 0: it is rigid [N/m]", ge=0, le=1e15
-    )
+    stiffness: Stiffness = setting(0.0, "of a rod that is a spring; 0: it is rigid [N/m]")
     damping: Stiffness = setting(0.0, "of a rod that is a spring [N s/m]")
 
     @property

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from dolfinopt.scene.tables.base import (
     MAX_ITERATIONS,
+    Extent,
     Length,
     Loc,
     Position,
@@ -49,12 +50,10 @@ class Design(Table):
     shared_volume: bool = setting(False, "one volume limit for all arms together [-]")
     initial: float = setting(0.5, "initial x of every cell [-]", ge=1e-6, le=1)
     minimum: float = setting(1e-3, "lower bound of x [-]", ge=1e-9, lt=1)
-    filter_radius: float = setting(
+    filter_radius: Extent = setting(
         0.0075,
         "radius of the equivalent cone filter; 0: no filter; default: an eighth of the "
         "height of the lowest arm [m]",
-        ge=0,
-        le=1e4,
     )
     projection: Projection = setting(
         False,
@@ -73,15 +72,13 @@ class Design(Table):
         ge=1e-3,
         le=0.499,
     )
-    minimum_member: float = setting(
+    minimum_member: Extent = setting(
         0.0,
         "smallest width of members with the robust projection; sets the filter "
         "radius (filter_radius stays at its default); 0: no limit, or minimum_gap [m]",
-        ge=0,
-        le=1e4,
     )
-    minimum_gap: float = setting(
-        0.0, "smallest width of gaps between members alike; 0: minimum_member [m]", ge=0, le=1e4
+    minimum_gap: Extent = setting(
+        0.0, "smallest width of gaps between members alike; 0: minimum_member [m]"
     )
 
     @property
@@ -460,8 +457,8 @@ OptimizerSteps = Annotated[int, Field(ge=1, le=MAX_ITERATIONS)]
 class Part(Table):
     """Parts for the workshop."""
 
-    tool_radius: float | None = setting(
-        None, "least radius of concave corners; default: 0.003 [m]", ge=0, le=1e4
+    tool_radius: Extent | None = setting(
+        None, "least radius of concave corners; default: 0.003 [m]"
     )
     tolerance: Length | None = setting(
         None, "how far sides may lie from the outline of the densities; default: a cell [m]"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from dolfinopt.scene.tables.base import Duration, Loc, Refusal, Table, Use, setting, shown
+from dolfinopt.scene.tables.base import Duration, Instant, Loc, Refusal, Table, Use, setting, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -30,12 +30,10 @@ class FeedForward(Table):
         "largest distance between the knots of the corrections' splines; default: as "
         "small as it takes to leave a ten thousandth of the deviation [s]",
     )
-    lead: float | None = setting(
+    lead: Instant | None = setting(
         None,
         "time before and after the motion in which joints may already, or still, be "
         "corrected; the path begins after it; default: 5 % of motion.duration [s]",
-        ge=0,
-        le=1e5,
     )
 
     @property

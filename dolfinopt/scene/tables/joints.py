@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator
 
@@ -239,36 +239,9 @@ def in_frame(arm: Arm, point: Point) -> Point:
 
 # -- gear, motor, bearing and friction: keys that [[arms]] and [[joints]] share -------------------
 
-RotorInertia = Annotated[
-    Inertia,
-    setting(
-        "moment of inertia of the rotor that drives the joint, about its own axis, "
-        "which is the joint's; not part of joint_inertia [kg m2]"
-    ),
-]
-GearRatio = Annotated[
-    float | None,
-    setting(
-        "revolutions of the rotor per revolution of the joint, against what the joint "
-        "sits on; of a prismatic joint in space radians per metre; stated with rotor_inertia [-]",
-        ge=1e-3,
-        le=1e6,
-    ),
-]
-GearStiffness = Annotated[
-    float,
-    setting(
-        "stiffness of the gear between motor and joint, about or along the "
-        "joint's axis, as the joint feels it; 0: none, the joint follows the motor exactly "
-        "[N m/rad, N/m]",
-        ge=0,
-        le=1e15,
-    ),
-]
-GearDamping = Annotated[
-    float,
-    setting("damper beside gear_stiffness [N m s/rad, N s/m]", ge=0, le=1e15),
-]
+OUT_OF_PLANE = {2: "along z", 3: "about x", 4: "about y"}
+# What a joint has with another part alone.
+OF_PARTS = (Use("gear_damping", "gear_stiffness"), Use("friction_speed", "friction"))
 
 
 def _zero_for_inf(values: Any) -> Any:
@@ -278,77 +251,76 @@ def _zero_for_inf(values: Any) -> Any:
     return tuple(0.0 if isinstance(x, float) and x == math.inf else x for x in values)
 
 
-BearingStiffness = Annotated[
-    Six[Stiffness] | None,
-    BeforeValidator(_zero_for_inf),
-    setting(
+class Drive(Table):
+    """What drives and holds a joint; in the plane keys of [[arms]], in space of [[joints]]."""
+
+    rotor_inertia: Inertia = setting(
+        0.0,
+        "moment of inertia of the rotor that drives the joint, about its own axis, "
+        "which is the joint's; not part of joint_inertia [kg m2]",
+    )
+    gear_ratio: float | None = setting(
+        None,
+        "revolutions of the rotor per revolution of the joint, against what the joint "
+        "sits on; of a prismatic joint in space radians per metre; stated with rotor_inertia [-]",
+        ge=1e-3,
+        le=1e6,
+    )
+    gear_stiffness: Stiffness = setting(
+        0.0,
+        "stiffness of the gear between motor and joint, about or along the "
+        "joint's axis, as the joint feels it; 0: none, the joint follows the motor exactly "
+        "[N m/rad, N/m]",
+    )
+    gear_damping: Stiffness = setting(0.0, "damper beside gear_stiffness [N m s/rad, N s/m]")
+    bearing_stiffness: Annotated[Six[Stiffness] | None, BeforeValidator(_zero_for_inf)] = setting(
+        None,
         "springs of the joint's bearing along x, y, z and about x, y, z of the "
         "joint's frame, between what the joint sits on and the joint; 0 or inf: rigid in that "
-        "direction. In the plane along x, y and about z alone [N/m, N m/rad]"
-    ),
-]
-BearingDamping = Annotated[
-    Six[Stiffness] | None,
-    setting("dampers beside bearing_stiffness, in the same order [N s/m, N m s/rad]"),
-]
-Friction = Annotated[
-    tuple[Stiffness, Stiffness] | None,
-    setting(
+        "direction. In the plane along x, y and about z alone [N/m, N m/rad]",
+    )
+    bearing_damping: Six[Stiffness] | None = setting(
+        None, "dampers beside bearing_stiffness, in the same order [N s/m, N m s/rad]"
+    )
+    friction: tuple[Stiffness, Stiffness] | None = setting(
+        None,
         "viscous coefficient f_v and Coulomb friction f_c at the motor, as the joint "
         "feels them: f_v v + f_c tanh(v / friction_speed) against its speed v "
-        "[N m s/rad, N m; N s/m, N]"
-    ),
-]
-FrictionSpeed = Annotated[
-    float,
-    setting(
+        "[N m s/rad, N m; N s/m, N]",
+    )
+    friction_speed: float = setting(
+        0.02,
         "speed at which Coulomb friction has 76 % of its value, which it tends to "
         "like tanh [rad/s, m/s]",
         ge=1e-6,
         le=1e6,
-    ),
-]
-FRICTION_SPEED = 0.02  # rad/s, m/s; default
+    )
 
-# What no joint has unless it is stated; in the plane keys of [[arms]], in space of [[joints]].
-PART_KEYS = (
-    "gear_stiffness", "gear_damping", "bearing_stiffness", "bearing_damping", "friction",
-    "friction_speed",
-)  # fmt: skip
-OUT_OF_PLANE = {2: "along z", 3: "about x", 4: "about y"}
+    def check_table(self) -> None:
+        """Refuse dampers of a bearing in directions without a spring."""
+        springs = self.bearing_stiffness or (0.0,) * 6
+        for i, damper in enumerate(self.bearing_damping or ()):
+            if damper > 0.0 and springs[i] == 0.0:
+                raise Refusal(
+                    f"expected 0 as number {i + 1}: bearing_stiffness has no spring there, beside "
+                    "which the damper would act",
+                    "bearing_damping",
+                    "bearing_stiffness",
+                )
 
-
-class _Table(Protocol):
-    bearing_stiffness: Six[Stiffness] | None
-    bearing_damping: Six[Stiffness] | None
-
-
-# What a joint has with another part alone.
-OF_PARTS = (Use("gear_damping", "gear_stiffness"), Use("friction_speed", "friction"))
-
-
-def check_dampers(table: _Table) -> None:
-    """Refuse dampers of a bearing in directions without a spring."""
-    springs = table.bearing_stiffness or (0.0,) * 6
-    for i, damper in enumerate(table.bearing_damping or ()):
-        if damper > 0.0 and springs[i] == 0.0:
-            raise Refusal(
-                f"expected 0 as number {i + 1}: bearing_stiffness has no spring there, beside "
-                "which the damper would act",
-                "bearing_damping",
-                "bearing_stiffness",
-            )
+    def check_plane_bearing(self) -> None:
+        """Refuse springs of a bearing in directions that the plane does not have."""
+        for i, direction in OUT_OF_PLANE.items():
+            if self.bearing_stiffness is not None and self.bearing_stiffness[i] > 0.0:
+                raise Refusal(
+                    f"expected 0 or inf as number {i + 1}, {direction}: without [[joints]] the "
+                    "machine moves in the plane, which holds it there",
+                    ".bearing_stiffness",
+                )
 
 
-def check_plane_bearing(table: _Table) -> None:
-    """Refuse springs of a bearing in directions that the plane does not have."""
-    for i, direction in OUT_OF_PLANE.items():
-        if table.bearing_stiffness is not None and table.bearing_stiffness[i] > 0.0:
-            raise Refusal(
-                f"expected 0 or inf as number {i + 1}, {direction}: without [[joints]] the machine "
-                "moves in the plane, which holds it there",
-                ".bearing_stiffness",
-            )
+DRIVE_KEYS = tuple(Drive.model_fields)
+OF_BEARINGS = ("bearing_stiffness", "bearing_damping")  # which fixed joints have, too
 
 
 @dataclass(frozen=True)
@@ -369,10 +341,6 @@ class JointParts:
     ratio: float
     bearing: tuple[Six[Stiffness], Six[Stiffness]] | None
     friction: Three[float] | None
-
-
-DRIVE_KEYS = ("rotor_inertia", "gear_ratio", *PART_KEYS)
-OF_BEARINGS = ("bearing_stiffness", "bearing_damping")  # which fixed joints have, too
 
 
 def stated_at(table: Any, key: str) -> bool:

@@ -28,18 +28,9 @@ from dolfinopt.scene.tables.base import (
 )
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
-    FRICTION_SPEED,
     OF_BEARINGS,
     OF_PARTS,
-    BearingDamping,
-    BearingStiffness,
-    Friction,
-    FrictionSpeed,
-    GearDamping,
-    GearRatio,
-    GearStiffness,
-    RotorInertia,
-    check_dampers,
+    Drive,
     check_direction,
     check_site,
     check_used,
@@ -66,7 +57,7 @@ def check_joint_name(name: str) -> str:
     return check_arm_name(name)
 
 
-class Joint(Table):
+class Joint(Drive):
     """A joint between the ground or an arm's outboard interface and the arm that it holds."""
 
     USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"), *OF_PARTS)
@@ -95,15 +86,6 @@ class Joint(Table):
     passive: bool = setting(
         False, "whether it has no drive and follows from the others by [[closures]] [-]"
     )
-
-    rotor_inertia: RotorInertia = 0.0
-    gear_ratio: GearRatio = None
-    gear_stiffness: GearStiffness = 0.0
-    gear_damping: GearDamping = 0.0
-    bearing_stiffness: BearingStiffness = None
-    bearing_damping: BearingDamping = None
-    friction: Friction = None
-    friction_speed: FrictionSpeed = FRICTION_SPEED
 
     position_limits: tuple[Position, Position] | None = setting(
         None,
@@ -135,7 +117,7 @@ class Joint(Table):
     def check_table(self) -> None:
         if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
             raise Refusal("expected the least first, then the largest", "position_limits")
-        check_dampers(self)
+        super().check_table()
         if self.axis is None and self.moves:
             raise Refusal(
                 f"expected an array of three numbers with a {self.type} joint", "axis", "type"
@@ -294,7 +276,7 @@ class Payload(Table):
     """What the end-effector carries."""
 
     BY_DIMENSION = ByDimension(in_space="offset arm", numbers="inertia")
-    mass: float = setting("point mass at the end-effector [kg]", ge=0, le=1e9)
+    mass: Inertia = setting("point mass at the end-effector [kg]")
     inertia: Inertia | Tensor = setting(
         0.0,
         "moment of inertia about its centre; in space about every axis, or the tensor "

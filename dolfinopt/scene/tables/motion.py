@@ -13,6 +13,7 @@ from dolfinopt.scene.tables.base import (
     Duration,
     FileName,
     Frequency,
+    Inertia,
     Instant,
     Length,
     Loc,
@@ -162,7 +163,7 @@ class Motion(Table):
         ge=-1e3,
         le=1e3,
     )
-    cart_mass: float = setting(0.0, "mass of the cart [kg]", ge=0, le=1e9)
+    cart_mass: Inertia = setting(0.0, "mass of the cart [kg]")
     joint_height: Position = setting(
         -0.5, "y of the shoulder joint; default: a quarter of the length of all arms below 0 [m]"
     )

@@ -9,7 +9,9 @@ from pydantic import Field, field_validator
 from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
+    Angle,
     ByDimension,
+    Extent,
     Instant,
     Loc,
     Refusal,
@@ -106,12 +108,10 @@ class Objective(Table):
         ge=2,
         le=100,
     )
-    stress_margin: float = setting(
+    stress_margin: Extent = setting(
         0.0,
         "cells closer than this to an interface do not count for the stress: at the "
         "corners of a clamped edge it grows without bound as cells shrink [m]",
-        ge=0,
-        le=1e4,
     )
     scenarios: Combination = setting(
         "sum", "how scenarios are combined in the objective: weighted sum, or smooth maximum [-]"
@@ -131,12 +131,10 @@ class Objective(Table):
     attached: Attached = setting(
         "rigid-body", "model of what an arm carries, for its eigenfrequencies [-]"
     )
-    elbow_angle: float | None = setting(
+    elbow_angle: Angle | None = setting(
         None,
         "angle of every joint outboard of an arm, for its eigenfrequencies; "
         "default: that at the middle of the path [rad]",
-        ge=-100,
-        le=100,
     )
     modes: ModeCount | Literal["first"] = setting(
         3,

@@ -38,14 +38,11 @@ LARGEST_LOAD = 1e9  # N, N m
 # -- limits: their ranges --------------------------------------------------------------------------
 
 Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
-Energy = Annotated[float, Field(ge=1e-15, le=1e15)]  # N m
 Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
 Angle = Annotated[float, Field(ge=1e-15, le=math.pi)]  # rad
 Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
 Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
-Effort = Annotated[float, Field(ge=1e-15, le=1e15)]  # -
 Factor = Annotated[float, Field(ge=1e-3, le=1e3)]  # -
-Rate = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3
 Ratio = Annotated[float, Field(ge=-0.99, le=0.99)]  # -
 Component = Annotated[float, Field(ge=-LARGEST_LOAD, le=LARGEST_LOAD)]  # N, N m
 
@@ -202,7 +199,7 @@ DECLARED: dict[str, Declaration] = {
             "N m",
             limit=Limited(
                 "upper limit of the compliance of the load cases, as summary.json has it [N m]",
-                Energy,
+                Positive,
                 "compliance",
                 options=(),
             ),
@@ -276,7 +273,6 @@ DECLARED: dict[str, Declaration] = {
             limit=Limited(
                 "upper limit of the weighted root mean square of the drives' forces, see "
                 "objective.effort_weights [-]",
-                Effort,
             ),
             options=("effort_weights",),
             exact=True,
@@ -365,7 +361,7 @@ DECLARED: dict[str, Declaration] = {
                 f"largest {what} along the path",
                 unit,
                 frozenset(),
-                Limited("", Rate, stated=False),
+                Limited("", stated=False),
                 objective=False,
                 exact=True,
                 of_nominal=True,

@@ -1,0 +1,377 @@
+"""What `dolfinopt export` writes: reduced arms, a linearised machine, a robot with new links."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+from mpi4py import MPI
+from scipy.io import savemat
+
+from dolfinopt.arms.arm import Arm, fixed_body
+from dolfinopt.cli.shared import claim, prepare, scene_of, tell, warn
+from dolfinopt.disk import working_in, write_arrays, write_atomically, write_bytes
+from dolfinopt.dynamics.build import check_instant
+from dolfinopt.dynamics.state_space import StateSpace
+from dolfinopt.errors import InputError
+from dolfinopt.exchange.in_space import in_space, plate_moments
+from dolfinopt.exchange.mbdyn import write_fem
+from dolfinopt.exchange.standard_input import lumped_nodes, modal_element, to_sid
+from dolfinopt.exchange.urdf.file import NewLink, read_robot, robot_text, sources_of
+from dolfinopt.exchange.urdf.robot import Inertia
+from dolfinopt.exchange.urdf.scene import Origin, read_origin
+from dolfinopt.interrupt import ending_at_once
+from dolfinopt.loading import load_scene
+from dolfinopt.multibody.shape_integrals import ShapeIntegrals
+from dolfinopt.output.design import arms_with_design, gather_views, under_law_of
+from dolfinopt.output.folders import PARTS, prepare_folder, remove_stale, stale_parts
+from dolfinopt.parallel import Partition, gather_arms, on_root, together
+from dolfinopt.profiling import Profile
+from dolfinopt.responses.evaluation import decide_stiffening
+from dolfinopt.responses.linearised_machine import linearised_machine
+from dolfinopt.responses.order_selection import choose_coordinates
+from dolfinopt.scene.load import Scene, pose_scenarios
+from dolfinopt.scene.sid import write_sid, write_sid_npz
+
+if TYPE_CHECKING:
+    from dolfinopt.study.tables import Table
+
+KINDS = (".sid", ".sid.npz", ".fem")
+
+
+def export_bodies(
+    world: MPI.Comm, scene: Scene, folder: Path, overwrite: bool, design: Path | None
+) -> None:
+    """Write the reduced arms of a scene."""
+    names = [f"{arm.name}{kind}" for arm in scene.arms for kind in KINDS]
+    claim(world, folder, overwrite, names, scene=scene)
+    partition, arms, x_phys = arms_with_design(world, scene, design, Profile())
+    prepare(world, folder)
+    tell(world, choose_coordinates(scene, partition, arms, x_phys, Profile()))
+    with together(world):
+        for k, arm in arms.items():
+            arm.state(x_phys[k])
+    decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
+    exported = {k: _exported(arm, scene.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
+    bodies = gather_arms(partition, exported)
+    if world.rank != 0:
+        return
+    for index, (arm, owner) in enumerate(zip(scene.arms, scene.owners, strict=True)):
+        if owner is None:
+            click.echo(f"{arm.name}: not exported, {_why(scene, index)}")
+            continue
+        data, element = bodies[owner]
+        write_sid(folder / f"{arm.name}.sid", data)
+        write_sid_npz(folder / f"{arm.name}.sid.npz", data)
+        write_fem(folder / f"{arm.name}.fem", element)
+        stiffness = ", geometric stiffness" if len(element.loads) else ""
+        click.echo(
+            f"{arm.name}: {data.mass:.6g} kg, {data.num_modes} coordinates, "
+            f"{len(element.labels)} nodes{stiffness}; in {folder / arm.name}.sid, .sid.npz, .fem"
+        )
+
+
+STATE_SPACE = ("state_space.npz", "state_space.mat")
+
+
+def export_state_space(
+    world: MPI.Comm,
+    scene: Scene,
+    folder: Path,
+    overwrite: bool,
+    design: Path | None,
+    at: float,
+    below: float | None,
+) -> None:
+    """Write a machine linearised at an instant, s."""
+    check_instant(scene, at)
+    claim(world, folder, overwrite, STATE_SPACE, scene=scene)
+    profile = Profile()
+    scene = on_root(world, under_law_of, scene, design)
+    partition, arms, x_phys = arms_with_design(world, scene, design, profile)
+    tell(world, choose_coordinates(scene, partition, arms, x_phys, profile))
+    model = linearised_machine(scene, partition, arms, x_phys, at, profile, below=below)
+    prepare(world, folder)
+    with together(world):
+        if world.rank == 0:
+            _write_state_space(folder, model)
+
+
+def _write_state_space(folder: Path, model: StateSpace) -> None:
+    """Write both files and say what they hold (root only)."""
+    arrays, npz, mat = model.arrays(), *(folder / name for name in STATE_SPACE)
+    # MATLAB has cell arrays for words of several lengths.
+    cells = {k: x.astype(object) if x.dtype.kind == "U" else x for k, x in arrays.items()}
+    write_atomically(mat, lambda stream: savemat(stream, cells, oned_as="column"))
+    write_arrays(npz, arrays)
+    kind = "with its control" if model.closed else "drives free"
+    click.echo(
+        f"{kind}, at {model.time:g} s: {len(model.states)} states, {len(model.inputs)} inputs, "
+        f"{len(model.outputs)} outputs; in {npz}, {mat.name}"
+    )
+    click.echo(f"  {_accuracy(model.accurate_below)}")
+    poles = [pole for pole in model.poles if pole.imag >= 0.0]
+    for pole in poles[:5]:
+        size = abs(pole)
+        damping = -pole.real / size if size > 0.0 else 0.0
+        click.echo(f"  pole {pole:.5g} 1/s: {size / (2.0 * np.pi):.4g} Hz, damping {damping:.3g}")
+    worst = max(poles, key=lambda pole: float(pole.real))
+    if model.closed and worst.real > 0.0:
+        warn(
+            [
+                f"linearised at {model.time:g} s the closed loop has an unstable pole, {worst:.4g} "
+                "1/s; see whether it stays where the machine rests, at 0 or motion.horizon"
+            ]
+        )
+
+
+def _accuracy(frequency: float) -> str:
+    """Return how far the poles can be trusted, against twice as many coordinates, Hz."""
+    if frequency == float("inf"):
+        return "all poles hold 1 %"
+    return f"poles below {frequency:.4g} Hz hold 1 %, those above need more coordinates (--below)"
+
+
+def _why(scene: Scene, index: int) -> str:
+    """Return why an arm has no files; of a rigid one what another program needs of it."""
+    if not scene.arms[index].rigid:
+        return "it comes from a file"
+    body = in_space(fixed_body(scene, index))
+    centre, tensor = body.inertia_about_centre()
+    place = ", ".join(f"{x:.6g}" for x in centre)
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = tensor
+    moments = ", ".join(f"{x:.6g}" for x in (xx, yy, zz, xy, xz, yz))
+    return (
+        f"it is rigid: {body.mass:.6g} kg, centre ({place}) m, xx, yy, zz, xy, xz, yz about it "
+        f"{moments} kg m2"
+    )
+
+
+def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
+    """Return an arm's SID and MBDyn element on the first of its ranks (collective there)."""
+    body = arm.reduce(x_phys)
+    title = f"{arm.mesh.name} of {arm.scene.name}"
+    nodes = None
+    if arm.mesh.dim == 2:
+        assert arm.basis is not None
+        body = in_space(body, plate_moments(arm.elastic, arm.basis, thickness))
+        nodes = lumped_nodes(arm.elastic, arm.basis, thickness)
+    if arm.elastic.comm.rank != 0:
+        return None
+    return to_sid(body, title), modal_element(body, nodes)
+
+
+# -- `dolfinopt export RUN robot`: a robot with the links of a finished run ----------------------
+
+PAGES = ("before_after.md", "before_after.csv", "before_after.html")
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """A finished run: its scene, and the arms as its design makes them."""
+
+    # folder, scene: of the run
+    folder: Path
+    scene: Scene
+    # partition, arms, x_phys: its design, on this rank
+    partition: Partition
+    arms: Mapping[int, Arm]
+    x_phys: Mapping[int, np.ndarray]
+    # of all arms with a design of their own, reduced; on the root
+    bodies: Mapping[int, ShapeIntegrals]
+
+
+def export_robot(
+    world: MPI.Comm, scene: Scene, run: Path, out: Path | None, overwrite: bool, before: Path | None
+) -> None:
+    """Write the robot that a run's scene was imported from, its solid links as they are now.
+
+    Args:
+        world: all ranks.
+        scene: of the run.
+        run: its folder, which `dolfinopt optimize` or `simulate` has written.
+        out: folder for the URDF file and the links' surfaces; None: urdf in the run's.
+        overwrite: whether to replace them.
+        before: folder of an earlier run, for a table and a page of what both do.
+    """
+    origin = on_root(world, _origin_of, scene, run)
+    folder = out or run / "urdf"
+    table = None
+    if before is not None:
+        from dolfinopt.study.before_after import compare_runs  # with pandas: half a second
+
+        table = on_root(world, compare_runs, before, run)
+    names = [origin.file.name, *(f"{arm}.stl" for arm in origin.links)]
+    on_root(world, _check_robot, origin.file, folder, names)
+    claim(world, folder, overwrite, [*names, *PAGES])
+    after = _reduced(world, run, scene)
+    links = _links(world, after)
+    sides = [] if before is None else _sides(world, before, after)
+    with together(world):
+        if world.rank == 0:
+            with ending_at_once():
+                files, said = _robot_files(scene, origin, folder, links)
+                if table is not None:
+                    files = _pages(table, sides) | files
+                    said.append(table.markdown())
+            _write_robot(folder, files, origin.file.name)
+            click.echo("\n".join(said))
+
+
+def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
+    """Raise InputError if the new robot would replace the one it is made of, or its meshes."""
+    if not file.is_file():
+        return  # told by whoever reads it
+    read = {path.resolve(): path for path in sources_of(file)}
+    for name in names:
+        if source := read.get((folder / name).resolve()):
+            raise InputError(
+                f"{source}: the robot is read from this file, and the new one would replace it; "
+                "name another --out"
+            )
+
+
+# Body and surface, (n, 3, 3) m, of arms by their names, on the root.
+_Links = Mapping[str, tuple["ShapeIntegrals", "np.ndarray"]]
+
+
+def _links(world: MPI.Comm, run: _Run) -> _Links:
+    """Return the links of a run: the parts that `dolfinopt part` made, or parts of its design."""
+    from dolfinopt.part.folder import SCENE
+    from dolfinopt.part.part import make_parts
+
+    folder = run.folder / PARTS
+    if not on_root(world, lambda: (folder / SCENE).is_file() and not stale_parts(folder)):
+        parts = make_parts(run.scene, run.folder, world=world)
+        owners = dict(zip((arm.name for arm in run.scene.arms), run.scene.owners, strict=True))
+        return {name: (run.bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
+    machine: Scene = on_root(world, load_scene, folder / SCENE)
+    bodies = _reduced(world, folder, machine, None).bodies
+    if world.rank:
+        return {}
+    files = {item.name: folder / f"{_owner(run.scene, item.name)}.stl" for item in machine.arms}
+    return {
+        item.name: (bodies[k], _surface(files[item.name]))
+        for k, item in enumerate(machine.arms)
+        if k in bodies and files[item.name].is_file()
+    }
+
+
+def _owner(scene: Scene, name: str) -> str:
+    """Return the name of the arm whose design an arm has."""
+    owner = scene.owners[[arm.name for arm in scene.arms].index(name)]
+    return name if owner is None else scene.arms[owner].name
+
+
+def _surface(file: Path) -> np.ndarray:
+    """Return the triangles (n, 3, 3) of an STL file in millimetres, m."""
+    import pyvista
+
+    mesh = pyvista.read(file)
+    return 1e-3 * mesh.points[mesh.regular_faces].astype(float)
+
+
+def _reduced(world: MPI.Comm, run: Path, scene: Scene, design: str | None = "design.npz") -> _Run:
+    """Return a finished run's arms, reduced (collective); without a design solid ones."""
+    densities = None if design is None else run / design
+    partition, arms, x_phys = arms_with_design(world, scene, densities, Profile())
+    with together(world):
+        mine = {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}
+    own = {k: x_phys[k] for k in arms}
+    return _Run(run, scene, partition, arms, own, gather_arms(partition, mine))
+
+
+def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
+    """Write all files, the robot last: where it is, the others belong to it (root only)."""
+    prepare_folder(folder)
+    with working_in(folder):
+        remove_stale(folder, [robot, *PAGES])
+        for name, data in files.items():
+            write_bytes(folder / name, data)
+
+
+# -- before and after ------------------------------------------------------------------------
+
+
+def _sides(world: MPI.Comm, before: Path, after: _Run) -> list[Any]:
+    """Return both runs as the page needs them, on the root (collective)."""
+    from dolfinopt.study.before_after import read_side
+
+    sides = []
+    for item in (_reduced(world, before, on_root(world, scene_of, before)), after):
+        views = gather_views(item.scene, item.partition, item.arms, item.x_phys)
+        with together(world):
+            if world.rank == 0:
+                sides.append(read_side(item.folder, item.scene, views, item.bodies))
+    return sides
+
+
+def _pages(table: Table, sides: list[Any]) -> dict[str, bytes]:
+    """Return table and page of both runs by the names of their files (root only)."""
+    from dolfinopt.study.before_after import before_after_page
+    from dolfinopt.study.sections import sections_of
+
+    before, after = sides
+    sections = sections_of(after.folder)
+    texts = {
+        ".md": table.markdown(),
+        ".csv": table.csv(),
+        ".html": before_after_page(before, after, table, sections),
+    }
+    return {f"{table.name}{kind}": text.encode() for kind, text in texts.items()}
+
+
+# -- the robot -------------------------------------------------------------------------------
+
+
+def _origin_of(scene: Scene, run: Path) -> Origin:
+    """Return where the scene's solids come from: the record is beside the trajectory."""
+    if scene.motion.file is None:
+        raise InputError(f"{run}: no scene of a robot, it has no table of joint coordinates")
+    return read_origin(Path(scene.motion.file))
+
+
+def _robot_files(
+    scene: Scene,
+    origin: Origin,
+    folder: Path,
+    now: _Links,
+) -> tuple[dict[str, bytes], list[str]]:
+    """Return the files by name, the robot last, and what has become of the links (root only)."""
+    from dolfinopt.part.workshop_files import triangle_bytes
+
+    before = read_robot(origin.file).links
+    links, index = [], {arm.name: k for k, arm in enumerate(scene.arms)}
+    files, said = {}, []
+    for name, link in origin.links.items():
+        if name not in now or link not in before:
+            warn([f"{name}: no solid arm of this scene, or no link {link!r}: it stays as it is"])
+            continue
+        frame, mesh = origin.frames[name], f"{name}.stl"
+        body, surface = now[name]
+        inertia = link_inertia(scene, index[name], body).posed(frame)
+        facets = surface @ frame[:3, :3].T + frame[:3, 3]
+        files[mesh] = triangle_bytes(facets, f"{name}, m")
+        links.append(NewLink(link, inertia, mesh))
+        said.append(f"{link}: {inertia.mass:.4g} kg, was {before[link].own.mass:.4g} kg")
+    files[origin.file.name] = robot_text(origin.file, links, folder)
+    said.append(f"the robot with these links: {folder / origin.file.name}")
+    return files, said
+
+
+def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
+    """Return the inertia of a solid arm in its frame, with what sits at its outboard interface.
+
+    Args:
+        scene: of the run.
+        index: of the arm.
+        body: its integrals in space.
+    """
+    arm = scene.arms[index]
+    own = Inertia(float(body.mass), *body.inertia_about_centre())
+    motor = Inertia(arm.joint_mass, np.array([arm.length, 0.0, 0.0]), arm.joint_inertia * np.eye(3))
+    return own + motor
