@@ -136,7 +136,7 @@ class Iterate:
         rises = self.projection.rises(self.problem.excess)
         shorter = 1.0
         for _ in range(STEP_ATTEMPTS):
-            new, after = self._proposed(shorter * self.reach * self.scene.optimizer.move)
+            new, after = self._proposed(shorter * self.reach * self.projection.move)
             if rises:
                 self.projection.advance()
             designs = self._tried(new)

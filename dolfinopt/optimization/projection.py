@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dolfinopt.optimization.measured import (
+    GENTLE,
     LEAST_REACH,
     REACHED_LIMIT_SHARE,
     SLOW_CONTINUATION,
@@ -26,6 +27,11 @@ class Projection:
         """Whether beta has reached its final value."""
         design = self.scene.design
         return not design.projection or self.beta >= design.sharpness
+
+    @property
+    def move(self) -> float:
+        """Move limit, shorter where the projection is steep and x_phys would leap."""
+        return self.scene.optimizer.move * min(1.0, GENTLE / self.beta)
 
     @property
     def least_reach(self) -> float:
