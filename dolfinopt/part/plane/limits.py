@@ -33,10 +33,7 @@ from dolfinopt.part.plane.curves import (
     within_half_turn,
 )
 from dolfinopt.part.plane.sides import (
-    ArcMoves,
     BrokenError,
-    LineMoves,
-    OwnMoves,
     Placed,
     Sides,
 )
@@ -112,19 +109,18 @@ class Limits:
         """Yield the rows of lengths and radii."""
         for item in sides.placed:
             curve, moves = item.piece.curve, item.moves
-            if isinstance(moves, ArcMoves):
-                assert isinstance(curve, Arc)
-                yield self.tool - curve.radius, -moves.radius
-            elif isinstance(moves, LineMoves):
+            assert moves is not None
+            if isinstance(curve, Line):
                 side = sides.loops[item.loop].sides[item.side]
                 d = unit(side.angle) if side.curve is None else direction(side.curve, 0.0)
                 length = float((curve.end - curve.start) @ d)
-                yield SHORT * self.cell - length, -d @ (moves.end - moves.start)
-            elif isinstance(moves, OwnMoves):
+                yield SHORT * self.cell - length, d @ (moves[:2] - moves[2:])
+            elif isinstance(curve, Arc) and item.piece.free:
+                yield self.tool - curve.radius, -moves[2]
+            else:
                 speed = np.linalg.norm(curve.derivative(GAUSS), axis=1)
                 ends = np.linalg.norm(curve.derivative(np.array([0.0, 1.0])), axis=1)
-                slope = ends[1] * moves.end - ends[0] * moves.start
-                yield SHORT * self.cell - float(WEIGHTS @ speed), -slope
+                yield SHORT * self.cell - float(WEIGHTS @ speed), ends * [1.0, -1.0] @ moves
 
     # -- widths of members and gaps ---------------------------------------------------------------
 
