@@ -36,6 +36,7 @@ from dolfinopt.part.plane.curves import (
     curvature,
     normals,
 )
+from dolfinopt.part.plane.limits import FACING
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, edges_of, with_volume
 
 if TYPE_CHECKING:
@@ -211,13 +212,11 @@ FINE = 0.2  # rad, there; halved for every further time
 # of their tetrahedra is 0.56 for 0.6.
 PLATE_TURN = 0.9
 LARGEST = 2.5  # side of a cell, cells of the design
-SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
 SAMPLES = 0.3  # distance of places where sizes are looked at, cells of the design
 # Places around each that may be the other side of a member. Without widths, and with cells of 1.5
 # at most, triangles are as well shaped, but 1.1 to 1.8 times as many.
 NEAREST = 48
-OPPOSED = -0.3  # cosine between the normals of both sides of a member, at most
 
 
 def body_mesh(
@@ -331,7 +330,7 @@ def _sizes(
         here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)
         turns = np.where(here, np.minimum(turns, FINE * 0.5**number), turns)
         side = np.where(here, 0.5 * side, side)
-    size = np.maximum(np.minimum(side, turns / bend), SMALLEST * cell)
+    size = np.minimum(side, turns / bend)
     for _ in range(3):
         size = (size[near] + GROWTH * apart).min(axis=1)
     return np.split(size, np.cumsum([len(t) for t in samples])[:-1])
@@ -350,7 +349,7 @@ def _widths(points: np.ndarray, inward: np.ndarray, near: np.ndarray) -> np.ndar
     """
     to = points[near] - points[:, None]
     depth = np.einsum("nkd,nd->nk", to, inward)
-    across = np.einsum("nkd,nd->nk", inward[near], inward) < OPPOSED
+    across = np.einsum("nkd,nd->nk", inward[near], inward) < -FACING
     square = np.square(to).sum(axis=2)
     across &= depth > 1e-3 * np.sqrt(square)
     width = np.divide(square, depth, out=np.full(depth.shape, np.inf), where=across)

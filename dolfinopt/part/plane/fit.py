@@ -50,7 +50,6 @@ from dolfinopt.part.plane.sides import (
 # SCARA's fore arm have 10 to 45 % more sides.
 LEAST = 0.4
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
-REACH = 3.0  # cells from the ends of two sides within which they meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,24 +468,19 @@ def _crossing(drawn: Drawn) -> Drawn:
 # -- corners --------------------------------------------------------------------------------------
 
 
-def _vertices(drawn: Sequence[Drawn], reach: float) -> tuple[np.ndarray, list[float]]:
+def _vertices(drawn: Sequence[Drawn]) -> tuple[np.ndarray, list[float]]:
     """Return where each side meets the one before (n, 2), and by how much the outline turns there.
 
-    The turn is NaN where they do not meet within a length, m, of their ends.
+    The turn is NaN where they do not meet.
     """
     places, turns = [], []
     for k, item in enumerate(drawn):
         before = drawn[k - 1]
-        near, turn = 0.5 * (before.end + item.start), float("nan")
-        apart = float(np.linalg.norm(before.end - item.start))
-        try:
-            place = meet(before.side, item.side, 0.0, near)
-            if np.linalg.norm(place - near) < reach + apart:
-                near = place
-                turn = turn_between(before.side.foot(place)[1], item.side.foot(place)[1])
-        except BrokenError:
-            pass
-        places.append(near)
+        place, turn = 0.5 * (before.end + item.start), float("nan")
+        with suppress(BrokenError):
+            place = meet(before.side, item.side, 0.0, place)
+            turn = turn_between(before.side.foot(place)[1], item.side.foot(place)[1])
+        places.append(place)
         turns.append(turn)
     return np.array(places), turns
 
@@ -508,7 +502,7 @@ def without(drawn: Sequence[Drawn], gone: set[int]) -> list[Drawn]:
 
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> Drawn | None:
     """Return the side to leave out, if there is one."""
-    places, turns = _vertices(drawn, REACH * limits.cell)
+    places, turns = _vertices(drawn)
     need = [limits.tool * np.tan(_half(turn)) if turn < 0.0 else 0.0 for turn in turns]
     worst, least = None, np.inf
     for k, item in enumerate(drawn):
@@ -560,7 +554,7 @@ def looped(
         radius_at: returns the wanted radius, m, of the corner before this side, at this place (2,),
             half of whose turn is this angle.
     """
-    places, turns = _vertices(drawn, REACH * limits.cell)
+    places, turns = _vertices(drawn)
     corners = []
     for k, (place, turn) in enumerate(zip(places, turns, strict=True)):
         a, b = drawn[k - 1].side, drawn[k].side

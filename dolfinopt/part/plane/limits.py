@@ -52,7 +52,6 @@ WIDE = 10.0  # cells: width from which on no member is told to be thin
 NEAR = 2.0  # least widths: distance up to which two pieces are looked at
 HALF = 5e-4  # m, of which rounded radii are multiples
 CHORD = 0.005  # distance of polygons from curves, cells
-EXACTLY = 0.01  # of it, up to which an area may be, over the slope
 # Material that is there whatever the level of the density, in cells: along interfaces, which are
 # rigid, and the least width of members, also of those that the design has and the level has not:
 # solid cells that share a corner are joined in the finite elements. Without them a light arm has 12
@@ -175,10 +174,10 @@ class Limits:
                 margin = np.full(len(g), 0.3 * KEPT)
                 if area is not None:
                     slope = sides.area_by_q() @ sides.ties
-                    whole_slope = EXACTLY * np.abs(slope).sum() or 1.0
-                    missing = (area - sides.shape.area) / whole_slope * np.array([1.0, -1.0])
+                    mean = np.abs(slope).sum() / max(len(slope), 1) or 1.0
+                    missing = (area - sides.shape.area) / mean * np.array([1.0, -1.0])
                     g, margin = np.append(g, missing), np.append(margin, [0.0, 0.0])
-                    A = np.vstack([A, np.outer([-1.0, 1.0], slope / whole_slope)])
+                    A = np.vstack([A, np.outer([-1.0, 1.0], slope / mean)])
                 if g.max(initial=-1.0) < KEPT:
                     return (sides, total) if self.is_simple(sides) else None
                 some = g > -FAR * self.cell
