@@ -28,7 +28,6 @@ from dolfinopt.part.plane.curves import (
     angle_of,
     direction,
     left,
-    sampled,
     unit,
     within_half_turn,
 )
@@ -179,7 +178,8 @@ class Limits:
                     g, margin = np.append(g, missing), np.append(margin, [0.0, 0.0])
                     A = np.vstack([A, np.outer([-1.0, 1.0], slope / mean)])
                 if g.max(initial=-1.0) < KEPT:
-                    return (sides, total) if self.is_simple(sides) else None
+                    simple = sides.shape.is_simple(CHORD * self.cell)
+                    return (sides, total) if simple else None
                 some = g > -FAR * self.cell
                 result = least_move(A[some], -g[some] - margin[some], self.cell)
                 if result is None or (size := np.abs(result[0]).max()) > 6.0 * FAR * self.cell:
@@ -190,10 +190,6 @@ class Limits:
                 return None
         return None
 
-    def is_simple(self, sides: Sides) -> bool:
-        """Return whether no side crosses another one."""
-        return sides.shape.is_simple(CHORD * self.cell)
-
 
 def interfaces(domain: Domain) -> list[Geometry]:
     """Return the lines of both interfaces."""
@@ -203,7 +199,7 @@ def interfaces(domain: Domain) -> list[Geometry]:
     return [
         shapely.union_all(
             [
-                shapely.LineString(np.vstack([sampled([edge.curve], chord), edge.curve.end]))
+                shapely.LineString(edge.curve.at(edge.curve.parameters(chord)))
                 for edge in domain.outline.edges
                 if edge.label == label
             ]
