@@ -110,7 +110,7 @@ class SolidPart:
         """Of the part, m3; of an extruded one that within its curves."""
         if self.flat is None:
             return self.surface.volume
-        return self.flat.shape.area * self.flat.domain.thickness
+        return self.flat.volume
 
     @cached_property
     def cavities(self) -> np.ndarray:
