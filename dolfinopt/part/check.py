@@ -8,7 +8,6 @@ on meshes of quadratic triangles along their curves or of quadratic tetrahedra i
 from __future__ import annotations
 
 import gc
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,11 +30,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report, unjudged
 from dolfinopt.scene.load import Scene, scene_from_dict
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from dolfinopt.scene.toml import tomllib
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -115,15 +110,10 @@ def simulate_parts(
         data = scene_data(scene, parts, folder)
         for table, keys in changes.items():
             data[table] = {**data.get(table, {}), **keys}
-        return _simulate_scene(data, start)
-
-
-def _simulate_scene(data: Mapping[str, Any], start: Sequence[Solution] = ()) -> Simulated:
-    """Simulate a machine whose arms are of solid material, by what part.toml holds of it."""
-    scene = scene_from_dict(tomllib.loads(toml_text(data)), source="part.toml")
-    partition, arms = _built(scene)
-    x_phys = {k: np.ones(arm.mesh.num_cells) for k, arm in arms.items()}
-    return _simulated(scene, partition, arms, x_phys, start)
+        machine = scene_from_dict(tomllib.loads(toml_text(data)), source="part.toml")
+        partition, arms = _built(machine)
+        x_phys = {k: np.ones(arm.mesh.num_cells) for k, arm in arms.items()}
+        return _simulated(machine, partition, arms, x_phys, start)
 
 
 def _built(scene: Scene) -> tuple[Partition, dict[int, Arm]]:

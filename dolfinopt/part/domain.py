@@ -7,7 +7,8 @@ on one line or circle within rounding become that line or arc again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from bisect import bisect
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from functools import cached_property
@@ -25,6 +26,7 @@ from dolfinopt.mesh.checks import cell_sizes, facet_corners
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.part.plane.curves import (
     DEGREE,
+    MM,
     Arc,
     Curve,
     Line,
@@ -60,21 +62,19 @@ class Edge:
 
 
 def loops(sides: np.ndarray) -> list[np.ndarray]:
-    """Chain directed sides (n, 2) of node numbers to closed loops of nodes."""
+    """Chain directed sides (n, 2) between nodes to closed loops; return the numbers of sides."""
     ahead: dict[int, list[int]] = {}
-    for a, b in sides:
-        ahead.setdefault(int(a), []).append(int(b))
+    for number, node in enumerate(sides[:, 0].tolist()):
+        ahead.setdefault(node, []).append(number)
     result = []
     while ahead:
-        first = next(iter(ahead))
-        loop, node = [], first
+        loop, node = [], next(iter(ahead))
         while node in ahead:
-            loop.append(node)
-            after = ahead[node]
-            node_after = after.pop()
-            if not after:
+            number = ahead[node].pop()
+            if not ahead[node]:
                 del ahead[node]
-            node = node_after
+            loop.append(number)
+            node = int(sides[number, 1])
         result.append(np.array(loop))
     return result
 
@@ -131,18 +131,14 @@ def _curves(points: np.ndarray, near: float) -> Iterator[Curve]:
 def _longest(points: np.ndarray, near: float) -> tuple[int, Curve]:
     """Return how many sides from the first point on make one line or arc, and that curve."""
 
-    def reach(fits: bool, count: int) -> int:
+    def reach(fits: Callable[[np.ndarray, float], object], least: int) -> int:
         """Return the largest number of points that a line or circle goes through."""
-        low, high = count, len(points)
-        while low < high:
-            middle = (low + high + 1) // 2
-            result = _circle(points[:middle], near) if fits else _straight(points[:middle], near)
-            low, high = (middle, high) if result else (low, middle - 1)
-        return low
+        counts = range(least + 1, len(points) + 1)
+        return least + bisect(counts, False, key=lambda n: not fits(points[:n], near))
 
-    straight = reach(False, 2)
-    if straight == 2 and len(points) >= FEWEST and _circle(points[:FEWEST], near) is not None:
-        count = reach(True, FEWEST)
+    straight = reach(_straight, 2)
+    if straight == 2 and _circle(points[:FEWEST], near) is not None:
+        count = reach(_circle, FEWEST)
         arc = _circle(points[:count], near)
         assert arc is not None
         return count - 1, arc
@@ -245,22 +241,33 @@ class Cells:
         """Corners (n_cells, 3 or 4, 2) around each cell, m."""
         return self.points[self.nodes]
 
-    def rim(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sides (n, 2, 2) that only one cell has, m, and which cell (n,)."""
-        cell, place = np.nonzero(np.bincount(self.facets.ravel())[self.facets] == 1)
-        after = (place + 1) % self.nodes.shape[1]
-        ends = [self.points[self.nodes[cell, k]] for k in (place, after)]
-        return np.stack(ends, axis=1), cell
+    def rim(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the sides that one of the chosen cells (n_cells,) alone has.
+
+        Their nodes (n, 2), facets (n,), and which cells (n,) they are of.
+        """
+        facets = np.where(chosen[:, None], self.facets, self.facets.max() + 1)
+        cell, place = np.nonzero(np.bincount(facets.ravel())[facets] == 1)
+        after = np.roll(self.nodes, -1, axis=1)
+        ends = np.stack([nodes[cell, place] for nodes in (self.nodes, after)], axis=1)
+        return ends, facets[cell, place], cell
 
 
 def region_of(mesh: ArmMesh, cells: Cells, chosen: np.ndarray) -> Region:
     """Return the region of the chosen cells (n_cells,), circles about joint axes exactly so."""
     extent = float(np.ptp(cells.points, axis=0).max())
     axes = np.array([[0.0, 0.0], mesh.outboard_point])
+    ends, facets, _ = cells.rim(chosen)
+    label = np.full(len(facets), "", dtype="<U8")
+    label[np.isin(facets, mesh.inboard_facets)] = INBOARD
+    label[np.isin(facets, mesh.outboard_facets)] = OUTBOARD
     return Region(
         [
-            [snapped(edge, axes, extent) for edge in recognise(cells.points[loop], labels, extent)]
-            for loop, labels in _boundary(mesh, cells, chosen)
+            [
+                snapped(edge, axes, extent)
+                for edge in recognise(cells.points[ends[loop, 0]], label[loop], extent)
+            ]
+            for loop in loops(ends)
         ]
     )
 
@@ -281,25 +288,6 @@ def cells_of(mesh: ArmMesh) -> Cells:
     nodes = np.where(turned[:, None], nodes[:, back], nodes)
     facets = np.where(turned[:, None], facets[:, np.roll(back, -1)], facets)
     return Cells(nodes, points, facets)
-
-
-def _boundary(
-    mesh: ArmMesh, cells: Cells, chosen: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the loops of nodes around the chosen cells, and what each side belongs to."""
-    ends = np.stack([cells.nodes, np.roll(cells.nodes, -1, axis=1)], axis=2)[chosen].reshape(-1, 2)
-    facet = cells.facets[chosen].ravel()
-    once = np.bincount(facet)[facet] == 1
-    ends, facet = ends[once], facet[once]
-    label = np.full(len(facet), "", dtype="<U8")
-    label[np.isin(facet, mesh.inboard_facets)] = INBOARD
-    label[np.isin(facet, mesh.outboard_facets)] = OUTBOARD
-    of = {(int(a), int(b)): name for (a, b), name in zip(ends, label, strict=True)}
-    result = []
-    for loop in loops(ends):
-        sides = zip(loop, np.roll(loop, -1), strict=True)
-        result.append((loop, np.array([of[int(a), int(b)] for a, b in sides])))
-    return result
 
 
 def _kept(
@@ -394,6 +382,17 @@ class Filled:
         """Share of the material in cells of densities between 0.1 and 0.9."""
         gray = (self.x_phys > 0.1) & (self.x_phys < 0.9)
         return float((self.x_phys * self.sizes)[gray].sum() / self.volume)
+
+    def left_out_words(self, count: int, size: float, dim: int) -> list[str]:
+        """Return what is said of pieces of a size, m2 or m3, that were left out."""
+        if not count:
+            return []
+        pieces = "1 piece" if count == 1 else f"{count} pieces"
+        return [
+            f"arm {self.name!r}: {pieces} without a joint to both interfaces "
+            f"({MM**dim * size:.3g} mm{dim}, {100.0 * size / self.volume:.2g} % of the volume) "
+            "left out"
+        ]
 
     @property
     def gray_words(self) -> list[str]:
@@ -496,8 +495,9 @@ def domain_of(
     """
     entry, like = scene.arms[index], scene.arms[scene.patterns.get(index, index)]
     cells = cells_of(mesh)
-    rim, rim_cells = cells.rim()
-    outline = region_of(mesh, cells, np.ones(mesh.num_cells, dtype=bool))
+    every = np.ones(mesh.num_cells, dtype=bool)
+    rim, _, rim_cells = cells.rim(every)
+    outline = region_of(mesh, cells, every)
     solid, void = region_of(mesh, cells, mesh.passive), region_of(mesh, cells, mesh.void)
     if index not in scene.patterns:  # there regions are scaled, and those of another arm
         solid = _kept(mesh, cells, mesh.passive, entry, "solid", outline)
@@ -511,7 +511,7 @@ def domain_of(
         field=_without_kept(mesh, mesh.fixed, x_phys if field is None else field),
         crisp=field is None and bool(scene.design.projection),
         links=_links(cells.nodes, mesh.centroid, x_phys, bool(scene.design.projection)),
-        rim=rim,
+        rim=cells.points[rim],
         rim_cells=rim_cells,
         outline=outline,
         solid=solid,
@@ -689,23 +689,14 @@ def _flat_domain(
     arm = scene.arms[index]
     if arm.cells is None or len(arm.cells) != 3:
         return None
-    place = _grid_places(arm, mesh.centroid)
-    values = np.empty((arm.cells[0] * arm.cells[1], arm.cells[2], 4))
+    plate = box_arm(MPI.COMM_SELF, arm.name, (arm.length, arm.height), arm.cells[:2])
+    column = cKDTree(plate.centroid).query(mesh.centroid[:, :2])[1]
     rows = x_phys, x_phys if field is None else field, mesh.passive, mesh.void
-    values[place // arm.cells[2], place % arm.cells[2]] = np.stack(rows, axis=1)
+    values = np.stack(rows, axis=1)[np.argsort(column, kind="stable")].reshape(
+        plate.num_cells, -1, len(rows)
+    )
     if np.ptp(values, axis=1).max() > ROUNDING:
         return None
-    plate = box_arm(MPI.COMM_SELF, arm.name, (arm.length, arm.height), arm.cells[:2])
-    thin = arm.unchecked_copy({"cells": (*arm.cells[:2], 1)})
-    points = np.column_stack([plate.centroid, np.zeros(plate.num_cells)])
-    x, smooth, passive, void = values.mean(axis=1)[_grid_places(thin, points)].T
+    x, smooth, passive, void = values.mean(axis=1).T
     plate = replace(plate, passive=passive > 0.5, void=void > 0.5)
     return domain_of(scene, index, plate, x, None if field is None else smooth)
-
-
-def _grid_places(arm: Arm, centroid: np.ndarray) -> np.ndarray:
-    """Return the places (n,) of a box's cells in its grid, z running fastest."""
-    assert arm.cells is not None
-    size = np.array([arm.length, arm.height, arm.thickness])
-    at = np.floor((centroid / size + [0.0, 0.5, 0.5]) * arm.cells).astype(int)
-    return np.ravel_multi_index(tuple(at.T), arm.cells)

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
-from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, tetrahedra_of
+from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, points_by_tag, tetrahedra_of
 from dolfinopt.part.domain import INBOARD, OUTBOARD, ROUNDING, SolidDomain
 from dolfinopt.part.plane.curves import (
     HALVINGS,
@@ -36,6 +36,7 @@ from dolfinopt.part.plane.curves import (
     curvature,
     normals,
 )
+from dolfinopt.part.plane.limits import FACING
 from dolfinopt.part.solid.surface import Surface, distance_to_faces, edges_of, with_volume
 
 if TYPE_CHECKING:
@@ -211,13 +212,11 @@ FINE = 0.2  # rad, there; halved for every further time
 # of their tetrahedra is 0.56 for 0.6.
 PLATE_TURN = 0.9
 LARGEST = 2.5  # side of a cell, cells of the design
-SMALLEST = 0.02  # likewise: tighter curves are cut short
 GROWTH = 0.5  # of the side of a cell over the distance from a smaller one
 SAMPLES = 0.3  # distance of places where sizes are looked at, cells of the design
 # Places around each that may be the other side of a member. Without widths, and with cells of 1.5
 # at most, triangles are as well shaped, but 1.1 to 1.8 times as many.
 NEAREST = 48
-OPPOSED = -0.3  # cosine between the normals of both sides of a member, at most
 
 
 def body_mesh(
@@ -331,7 +330,7 @@ def _sizes(
         here = cKDTree(places).query(points)[0] < np.maximum(size, SAMPLES * cell)
         turns = np.where(here, np.minimum(turns, FINE * 0.5**number), turns)
         side = np.where(here, 0.5 * side, side)
-    size = np.maximum(np.minimum(side, turns / bend), SMALLEST * cell)
+    size = np.minimum(side, turns / bend)
     for _ in range(3):
         size = (size[near] + GROWTH * apart).min(axis=1)
     return np.split(size, np.cumsum([len(t) for t in samples])[:-1])
@@ -350,7 +349,7 @@ def _widths(points: np.ndarray, inward: np.ndarray, near: np.ndarray) -> np.ndar
     """
     to = points[near] - points[:, None]
     depth = np.einsum("nkd,nd->nk", to, inward)
-    across = np.einsum("nkd,nd->nk", inward[near], inward) < OPPOSED
+    across = np.einsum("nkd,nd->nk", inward[near], inward) < -FACING
     square = np.square(to).sum(axis=2)
     across &= depth > 1e-3 * np.sqrt(square)
     width = np.divide(square, depth, out=np.full(depth.shape, np.inf), where=across)
@@ -373,29 +372,19 @@ def _divided(curve: Curve, t: np.ndarray, size: np.ndarray) -> tuple[np.ndarray,
 
 def _triangulated(gmsh: Any, outline: _Outline) -> tuple[np.ndarray, np.ndarray]:
     """Return points, those of the outline first and in its order, and triangles between them."""
-    geo, corners = gmsh.model.geo, np.vstack(outline.loops)
-    tags = [geo.addPoint(x, y, 0.0, h) for (x, y), h in zip(corners, outline.sizes, strict=True)]
-    rings, first = [], 0
-    for loop in outline.loops:
-        own = tags[first : first + len(loop)]
-        first += len(loop)
-        lines = [geo.addLine(a, b) for a, b in zip(own, [*own[1:], own[0]])]
-        for line in lines:
-            geo.mesh.setTransfiniteCurve(line, 2)
-        rings.append(geo.addCurveLoop(lines))
-    geo.addPlaneSurface(rings)
+    geo, mesh = gmsh.model.geo, gmsh.model.mesh
+    for (x, y), h in zip(np.vstack(outline.loops), outline.sizes, strict=True):
+        geo.addPoint(x, y, 0.0, h)
+    for a, b in outline.sides + 1:  # Gmsh numbers points, lines and nodes from 1, in this order
+        geo.mesh.setTransfiniteCurve(geo.addLine(a, b), 2)
+    ends = np.cumsum([1, *map(len, outline.loops)])
+    geo.addPlaneSurface([geo.addCurveLoop(range(a, b)) for a, b in pairwise(ends)])
     geo.synchronize()
     gmsh.option.setNumber("Mesh.ElementOrder", 1)
     gmsh.option.setNumber("Mesh.Algorithm", 6)  # frontal: well-shaped triangles
-    gmsh.model.mesh.generate(2)
-    names, places, _ = gmsh.model.mesh.getNodes()
-    table = np.full(int(names.max()) + 1, -1)
-    points = places.reshape(-1, 3)[:, :2]
-    on_outline = cKDTree(points).query(corners)[1]
-    order = np.concatenate([on_outline, np.setdiff1d(np.arange(len(points)), on_outline)])
-    table[names[order].astype(int)] = np.arange(len(points))
-    nodes = gmsh.model.mesh.getElementsByType(TRIANGLE)[1].astype(int).reshape(-1, 3)
-    points, triangles = points[order], table[nodes]
+    mesh.generate(2)
+    points = points_by_tag(gmsh)[1:, :2]
+    triangles = mesh.getElementsByType(TRIANGLE)[1].astype(int).reshape(-1, 3) - 1
     turned = triangle_areas(points, triangles) < 0.0
     triangles[turned] = triangles[turned][:, ::-1]
     return points, triangles

@@ -16,7 +16,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from dolfinopt.part.plane.curves import DEGREE, MM, Arc, Curve, Line, Piece, Shape, Spline
+from dolfinopt.part.plane.curves import DEGREE, MM, Arc, Curve, Line, Piece, Shape, Spline, is_ring
 from dolfinopt.part.solid.surface import Surface
 
 HALF = 0.9 * np.pi  # sweep of an arc from which on it is divided
@@ -62,7 +62,7 @@ def solid_text(shape: Shape, thickness: float, name: str, bottom: float = 0.0) -
 
 def _edges(loop: tuple[Piece, ...]) -> list[tuple[Curve, str]]:
     """Return a loop's curves and their names: arcs below half a turn, splines by polynomials."""
-    if _is_circle(loop):
+    if is_ring(loop[0].curve):
         return [(loop[0].curve, loop[0].label)]
     return [(curve, piece.label) for piece in loop for curve in _divided(piece.curve)]
 
@@ -281,7 +281,7 @@ def r12_text(shape: Shape, tolerance: float) -> str:
         model = document.modelspace()
         for k, loop in enumerate(shape.loops):
             look = {"layer": _layer(k, loop)}
-            if _is_circle(loop):
+            if is_ring(loop[0].curve):
                 _draw(model, loop[0].curve, look)
                 continue
             corners = [corner for piece in loop for corner in _corners(piece.curve, tolerance)]
@@ -326,13 +326,9 @@ def _text(document: Any) -> str:
 
 def _layer(number: int, loop: tuple[Piece, ...]) -> str:
     """Return the layer of a loop: round holes of the arm's own are bores."""
-    if number and _is_circle(loop) and not loop[0].free:
+    if number and is_ring(loop[0].curve) and not loop[0].free:
         return BORES
     return HOLES if number else OUTLINE
-
-
-def _is_circle(loop: tuple[Piece, ...]) -> bool:
-    return len(loop) == 1 and isinstance(loop[0].curve, Arc) and loop[0].curve.is_circle
 
 
 def _draw(model: Any, curve: Curve, look: dict[str, Any]) -> None:

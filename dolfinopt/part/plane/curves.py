@@ -354,7 +354,7 @@ class Shape:
     @property
     def entities(self) -> str:
         """How many curves it has of every kind, in words."""
-        kinds = ["circle" if _is_ring(c) else type(c).__name__.lower() for c in self.curves]
+        kinds = ["circle" if is_ring(c) else type(c).__name__.lower() for c in self.curves]
         counts = {kind: kinds.count(kind) for kind in ("line", "arc", "circle", "spline")}
         named = [f"{n} {kind}{'s' * (n > 1)}" for kind, n in counts.items() if n]
         return ", ".join(named)
@@ -411,7 +411,8 @@ def are_simple(loops: list[np.ndarray]) -> bool:
     return bool(shapely.is_valid(shapely.Polygon(loops[0], loops[1:])))
 
 
-def _is_ring(curve: Curve) -> bool:
+def is_ring(curve: Curve) -> bool:
+    """Return whether a curve is a whole circle."""
     return isinstance(curve, Arc) and curve.is_circle
 
 

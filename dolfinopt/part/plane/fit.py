@@ -50,7 +50,6 @@ from dolfinopt.part.plane.sides import (
 # SCARA's fore arm have 10 to 45 % more sides.
 LEAST = 0.4
 UPRIGHT = np.radians(30.0)  # of a line across the axis of symmetry, which it then crosses squarely
-REACH = 3.0  # cells from the ends of two sides within which they meet
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,9 +264,7 @@ def _contours(outline: Outline, hole: float) -> Iterator[_Contour]:
     if domain.symmetric:
         wide = np.array([4.0 * domain.extent, 0.0])
         curves = [*curves, Line(-wide, wide)]
-    lines = [
-        shapely.LineString(np.vstack([c.at(c.parameters(outline.chord)), c.end])) for c in curves
-    ]
+    lines = [shapely.LineString(c.at(c.parameters(outline.chord))) for c in curves]
     for ring in _rings(outline):
         runs = _runs(ring, lines, outline.chord)
         for chain, halved in _chains(runs, len(domain.edges) if domain.symmetric else -2):
@@ -308,11 +305,10 @@ class _Pen:
         drawn = cleaned(drawn, self.limits)
         if not drawn:
             return None
-        if _is_circle(drawn):
-            curve = drawn[0].side.curve
-            assert curve is not None
-            piece = Piece(curve, drawn[0].side.label)
-            return Sides((), (), ((piece,), (_mirrored(piece),)) if twins else ((piece,),))
+        own, label = drawn[0].side.curve, drawn[0].side.label
+        if len(drawn) == 1 and own is not None and np.linalg.norm(own.end - own.start) < 1e-9:
+            curves = (own, own.mirrored().reversed())[: 1 + twins]
+            return Sides((), (), tuple((Piece(curve, label),) for curve in curves))
         pair = [drawn]
         if twins:
             pair[0] = [item.named(twin=next(names)) for item in drawn]
@@ -334,20 +330,6 @@ def _chains(runs: list[Run], axis: int) -> Iterator[tuple[list[Run], bool]]:
     for a, b in pairwise([*cuts, cuts[0] + len(runs)]):
         if chain := [runs[k % len(runs)] for k in range(a + 1, b)]:
             yield chain, True
-
-
-def _is_circle(drawn: Sequence[Drawn]) -> bool:
-    """Return whether one closed curve of the arm makes a ring."""
-    curve = drawn[0].side.curve
-    return (
-        len(drawn) == 1
-        and curve is not None
-        and bool(np.linalg.norm(curve.end - curve.start) < 1e-9)
-    )
-
-
-def _mirrored(piece: Piece) -> Piece:
-    return replace(piece, curve=piece.curve.mirrored().reversed())
 
 
 def _runs_along(curve: Curve, points: np.ndarray) -> bool:
@@ -424,16 +406,8 @@ def _distinct(drawn: Sequence[Drawn], halved: bool = False) -> list[Drawn]:
 
 
 def _goes_on(a: Side, b: Side) -> bool:
-    """Return whether a curve of the arm's own goes on as another one."""
-    if a.curve is None or b.curve is None or a.label != b.label:
-        return False
-    if isinstance(a.curve, Arc) and isinstance(b.curve, Arc):
-        apart = np.linalg.norm(a.curve.centre - b.curve.centre)
-        return bool(apart + abs(a.curve.radius - b.curve.radius) < 1e-7)
-    if isinstance(a.curve, Line) and isinstance(b.curve, Line):
-        off = (b.point - a.point) @ left(unit(a.angle))
-        return abs(turn_between(unit(a.angle), unit(b.angle))) < 1e-6 and abs(off) < 1e-7
-    return a.edge == b.edge
+    """Return whether two sides are along one curve of the arm's own."""
+    return a.edge == b.edge >= 0
 
 
 def _whole(half: Sequence[Drawn], names: Iterator[int]) -> list[Drawn]:
@@ -469,24 +443,19 @@ def _crossing(drawn: Drawn) -> Drawn:
 # -- corners --------------------------------------------------------------------------------------
 
 
-def _vertices(drawn: Sequence[Drawn], reach: float) -> tuple[np.ndarray, list[float]]:
+def _vertices(drawn: Sequence[Drawn]) -> tuple[np.ndarray, list[float]]:
     """Return where each side meets the one before (n, 2), and by how much the outline turns there.
 
-    The turn is NaN where they do not meet within a length, m, of their ends.
+    The turn is NaN where they do not meet.
     """
     places, turns = [], []
     for k, item in enumerate(drawn):
         before = drawn[k - 1]
-        near, turn = 0.5 * (before.end + item.start), float("nan")
-        apart = float(np.linalg.norm(before.end - item.start))
-        try:
-            place = meet(before.side, item.side, 0.0, near)
-            if np.linalg.norm(place - near) < reach + apart:
-                near = place
-                turn = turn_between(before.side.foot(place)[1], item.side.foot(place)[1])
-        except BrokenError:
-            pass
-        places.append(near)
+        place, turn = 0.5 * (before.end + item.start), float("nan")
+        with suppress(BrokenError):
+            place = meet(before.side, item.side, 0.0, place)
+            turn = turn_between(before.side.foot(place)[1], item.side.foot(place)[1])
+        places.append(place)
         turns.append(turn)
     return np.array(places), turns
 
@@ -508,7 +477,7 @@ def without(drawn: Sequence[Drawn], gone: set[int]) -> list[Drawn]:
 
 def _worst(drawn: Sequence[Drawn], limits: Limits) -> Drawn | None:
     """Return the side to leave out, if there is one."""
-    places, turns = _vertices(drawn, REACH * limits.cell)
+    places, turns = _vertices(drawn)
     need = [limits.tool * np.tan(_half(turn)) if turn < 0.0 else 0.0 for turn in turns]
     worst, least = None, np.inf
     for k, item in enumerate(drawn):
@@ -560,7 +529,7 @@ def looped(
         radius_at: returns the wanted radius, m, of the corner before this side, at this place (2,),
             half of whose turn is this angle.
     """
-    places, turns = _vertices(drawn, REACH * limits.cell)
+    places, turns = _vertices(drawn)
     corners = []
     for k, (place, turn) in enumerate(zip(places, turns, strict=True)):
         a, b = drawn[k - 1].side, drawn[k].side

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 BAY, LAST, STEEPER = 4.0, 0.6, 0.7  # of the first arm; of the last one over it; of every truss
 STRUT = 0.6  # width of struts over that of the flanges
 FEWEST = 2  # bays of the first truss; every further one of a short arm has one more
-CLOSE = 0.2  # distance of its sides from the polygon, cells
 
 
 def trusses_of(parts: Mapping[int, PlanePart], number: int) -> dict[int, PlanePart]:
@@ -83,7 +82,7 @@ def _truss(part: PlanePart, slope: float, fewest: int) -> PlanePart:
     result = replace(drawn, polygon=sharp, islands=0, islands_area=0.0, filled=0)
     area = domain.volume * (1.0 + max(excess, 0.0))
     try:
-        sides = fitted_sides(result, limits, CLOSE * domain.cell, area)
+        sides = fitted_sides(result, limits, domain.cell, area)
     except InputError as error:
         raise ConvergenceError(str(error)) from None
     return replace(part, outline=result, sides=sides)

@@ -28,15 +28,11 @@ from dolfinopt.part.plane.curves import (
     angle_of,
     direction,
     left,
-    sampled,
     unit,
     within_half_turn,
 )
 from dolfinopt.part.plane.sides import (
-    ArcMoves,
     BrokenError,
-    LineMoves,
-    OwnMoves,
     Placed,
     Sides,
 )
@@ -55,7 +51,6 @@ WIDE = 10.0  # cells: width from which on no member is told to be thin
 NEAR = 2.0  # least widths: distance up to which two pieces are looked at
 HALF = 5e-4  # m, of which rounded radii are multiples
 CHORD = 0.005  # distance of polygons from curves, cells
-EXACTLY = 0.01  # of it, up to which an area may be, over the slope
 # Material that is there whatever the level of the density, in cells: along interfaces, which are
 # rigid, and the least width of members, also of those that the design has and the level has not:
 # solid cells that share a corner are joined in the finite elements. Without them a light arm has 12
@@ -112,19 +107,18 @@ class Limits:
         """Yield the rows of lengths and radii."""
         for item in sides.placed:
             curve, moves = item.piece.curve, item.moves
-            if isinstance(moves, ArcMoves):
-                assert isinstance(curve, Arc)
-                yield self.tool - curve.radius, -moves.radius
-            elif isinstance(moves, LineMoves):
+            assert moves is not None
+            if isinstance(curve, Line):
                 side = sides.loops[item.loop].sides[item.side]
                 d = unit(side.angle) if side.curve is None else direction(side.curve, 0.0)
                 length = float((curve.end - curve.start) @ d)
-                yield SHORT * self.cell - length, -d @ (moves.end - moves.start)
-            elif isinstance(moves, OwnMoves):
+                yield SHORT * self.cell - length, d @ (moves[:2] - moves[2:])
+            elif isinstance(curve, Arc) and item.piece.free:
+                yield self.tool - curve.radius, -moves[2]
+            else:
                 speed = np.linalg.norm(curve.derivative(GAUSS), axis=1)
                 ends = np.linalg.norm(curve.derivative(np.array([0.0, 1.0])), axis=1)
-                slope = ends[1] * moves.end - ends[0] * moves.start
-                yield SHORT * self.cell - float(WEIGHTS @ speed), -slope
+                yield SHORT * self.cell - float(WEIGHTS @ speed), ends * [1.0, -1.0] @ moves
 
     # -- widths of members and gaps ---------------------------------------------------------------
 
@@ -179,12 +173,13 @@ class Limits:
                 margin = np.full(len(g), 0.3 * KEPT)
                 if area is not None:
                     slope = sides.area_by_q() @ sides.ties
-                    whole_slope = EXACTLY * np.abs(slope).sum() or 1.0
-                    missing = (area - sides.shape.area) / whole_slope * np.array([1.0, -1.0])
+                    mean = np.abs(slope).sum() / max(len(slope), 1) or 1.0
+                    missing = (area - sides.shape.area) / mean * np.array([1.0, -1.0])
                     g, margin = np.append(g, missing), np.append(margin, [0.0, 0.0])
-                    A = np.vstack([A, np.outer([-1.0, 1.0], slope / whole_slope)])
+                    A = np.vstack([A, np.outer([-1.0, 1.0], slope / mean)])
                 if g.max(initial=-1.0) < KEPT:
-                    return (sides, total) if self.is_simple(sides) else None
+                    simple = sides.shape.is_simple(CHORD * self.cell)
+                    return (sides, total) if simple else None
                 some = g > -FAR * self.cell
                 result = least_move(A[some], -g[some] - margin[some], self.cell)
                 if result is None or (size := np.abs(result[0]).max()) > 6.0 * FAR * self.cell:
@@ -195,10 +190,6 @@ class Limits:
                 return None
         return None
 
-    def is_simple(self, sides: Sides) -> bool:
-        """Return whether no side crosses another one."""
-        return sides.shape.is_simple(CHORD * self.cell)
-
 
 def interfaces(domain: Domain) -> list[Geometry]:
     """Return the lines of both interfaces."""
@@ -208,7 +199,7 @@ def interfaces(domain: Domain) -> list[Geometry]:
     return [
         shapely.union_all(
             [
-                shapely.LineString(np.vstack([sampled([edge.curve], chord), edge.curve.end]))
+                shapely.LineString(edge.curve.at(edge.curve.parameters(chord)))
                 for edge in domain.outline.edges
                 if edge.label == label
             ]

@@ -116,20 +116,13 @@ class PlanePart:
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
         domain, outline = self.domain, self.outline
-        result = []
-        result += domain.gray_words
+        result = domain.gray_words
         if domain.crisp:
             result.append(
                 f"arm {domain.name!r}: design.npz does not tell what its densities were projected "
                 "from, as that of an optimisation does; the outline is that of the cells, blurred"
             )
-        if outline.islands:
-            share = 100.0 * outline.islands_area / domain.volume
-            number = _count(outline.islands, "piece")
-            result.append(
-                f"arm {domain.name!r}: {number} without a joint to both interfaces "
-                f"({1e6 * outline.islands_area:.3g} mm2, {share:.2g} % of the volume) left out"
-            )
+        result += domain.left_out_words(outline.islands, outline.islands_area, 2)
         if self.tight:
             listed = "; ".join(map(str, self.tight))
             tool = MM * outline.tool_radius
@@ -249,7 +242,3 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS, more: float = 1.0) -> P
     if curves.rounds:
         sides = rounded_radii(sides, limits)
     return PlanePart(domain, outline, sides, fine)
-
-
-def _count(number: int, name: str) -> str:
-    return f"{number} {name}" if number == 1 else f"{number} {name}s"

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -167,81 +168,46 @@ def meet(a: Side, b: Side, reach: float, near: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class LineMoves:
-    """Derivatives (2, n) by q of both ends of a line."""
-
-    start: np.ndarray
-    end: np.ndarray
-
-    def pull(self, curve: Line, t: np.ndarray, g: np.ndarray, count: int = 0) -> np.ndarray:
-        """Return sum_k g_k . dp(t_k)/dq (m, n) for t (k,) and g (m, k, 2)."""
-        return np.einsum("k,mkd,dn->mn", 1.0 - t, g, self.start) + np.einsum(
-            "k,mkd,dn->mn", t, g, self.end
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class OwnMoves:
-    """Derivatives (n,) by q of the parameter at both ends of a curve of the arm's own."""
-
-    start: np.ndarray
-    end: np.ndarray
-
-    def pull(self, curve: Curve, t: np.ndarray, g: np.ndarray, count: int = 0) -> np.ndarray:
-        """Return sum_k g_k . dp(t_k)/dq, see `LineMoves.pull`."""
-        along = (g * curve.derivative(t)).sum(axis=2)
-        return np.outer(along @ (1.0 - t), self.start) + np.outer(along @ t, self.end)
-
-
-@dataclass(frozen=True, eq=False)
-class ArcMoves:
-    """Derivatives by q of an arc's centre (2, n), radius (n,) and angles at both ends (n,)."""
-
-    centre: np.ndarray
-    radius: np.ndarray
-    start: np.ndarray
-    end: np.ndarray
-
-    def pull(self, curve: Arc, t: np.ndarray, g: np.ndarray, count: int = 0) -> np.ndarray:
-        """Return sum_k g_k . dp(t_k)/dq, see `LineMoves.pull`.
-
-        With a count of sides it is that of nodes of a mesh, which stand off the arc (`Arc.off`).
-        """
-        out = unit(curve.begin + curve.sweep * t)
-        share, slope = curve.off(t, count)
-        turns = np.outer((g * out).sum(axis=2) @ (curve.radius * slope), self.end - self.start)
-        along = (g * left(out)).sum(axis=2)
-        along = along * (curve.radius * share)
-        return (
-            g.sum(axis=1) @ self.centre
-            + np.outer((g * out).sum(axis=2) @ share, self.radius)
-            + np.outer(along @ (1.0 - t), self.start)
-            + np.outer(along @ t, self.end)
-            + turns
-        )
-
-
-@dataclass(frozen=True, eq=False)
 class Placed:
     """A piece of the outline, how it moves, and which loop and side, or corner, it is.
 
     Attributes:
-        piece, moves: moves are None of what stays.
+        piece: of the outline.
+        moves: derivatives by q: of both ends of a line (4, n); of centre, radius and angles at both
+            ends of an arc that moves (5, n); of the parameter at both ends of another curve of the
+            arm's own (2, n). None of what stays.
         loop: number of its loop; -1 of circles and of what stays.
         side: number of the side, or of the corner.
         fillet: whether it is a fillet.
     """
 
     piece: Piece
-    moves: LineMoves | OwnMoves | ArcMoves | None
+    moves: np.ndarray | None
     loop: int = -1
     side: int = -1
     fillet: bool = False
 
     def pull(self, t: np.ndarray, g: np.ndarray, count: int = 0) -> np.ndarray:
-        """Return sum_k g_k . dp(t_k)/dq (m, n), see `LineMoves.pull`."""
-        assert self.moves is not None
-        return self.moves.pull(self.piece.curve, t, g, count)  # type: ignore[arg-type]
+        """Return sum_k g_k . dp(t_k)/dq (m, n) for t (k,) and g (m, k, 2).
+
+        With a count of sides it is that of nodes of a mesh, which stand off an arc (`Arc.off`).
+        """
+        by_moves = np.tensordot(g, self._slopes(t, count), axes=((1, 2), (1, 2)))
+        return np.asarray(by_moves @ self.moves)
+
+    def _slopes(self, t: np.ndarray, count: int) -> np.ndarray:
+        """Return by how much points follow each of `moves` (j, k, 2)."""
+        curve, last = self.piece.curve, t[:, None]
+        first, axes = 1.0 - last, np.eye(2)[:, None] + np.zeros((len(t), 1))
+        if isinstance(curve, Line):
+            return np.concatenate([first * axes, last * axes])
+        if not (isinstance(curve, Arc) and self.piece.free):
+            along = curve.derivative(t)
+            return np.stack([first * along, last * along])
+        out = unit(curve.begin + curve.sweep * t)
+        share, slope = (item[:, None] for item in curve.off(t, count))
+        around, off = curve.radius * share * left(out), curve.radius * slope * out
+        return np.concatenate([axes, [share * out, first * around - off, last * around + off]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,10 +297,9 @@ class Sides:
 
     def _of_circles(self) -> Iterator[Placed]:
         count, first = self.numbers[0], self.of_circles
-        every, still = np.eye(count), np.zeros(count)
+        still = np.zeros((2, count))
         for k, circle in enumerate(self.circles):
-            at = first + 3 * k
-            moves = ArcMoves(every[at : at + 2], every[at + 2], still, still)
+            moves = np.vstack([np.eye(3, count, first + 3 * k), still])
             ring = Arc(circle.centre, circle.radius, 0.0, -2.0 * np.pi)
             yield Placed(Piece(ring, free=True), moves)
 
@@ -346,8 +311,8 @@ class Sides:
                     before, behind = meeting.before, meeting.after
                     begin = angle_of(-before.normal)
                     arc = Arc(meeting.centre, loop.corners[k].radius, begin, meeting.turn)
-                    angles = before.by_angle, behind.by_angle
-                    moves = ArcMoves(meeting.by_centre, meeting.by_radius, *angles)
+                    ends = before.by_angle, behind.by_angle
+                    moves = np.vstack([meeting.by_centre, meeting.by_radius, *ends])
                     yield Placed(Piece(arc, free=True), moves, i, k, True)
                 yield _side(side, meeting.after, after.before, i, k)
 
@@ -454,36 +419,37 @@ class Sides:
     def ties(self) -> np.ndarray:
         """T (n, count) with q = T x; x are lengths, of turns the move of a side's end, m."""
         count, sides, corners = self.numbers
-        image, sign = np.arange(count), np.ones(count)
-        at = {self.loops[i].sides[k].key: j for (i, k), j in sides.items()}
-        for (i, k), j in sides.items():
-            if (twin := at.get(self.loops[i].sides[k].twin)) is not None:
-                image[j : j + 2], sign[j + 1] = (twin, twin + 1), -1.0
-        ends = {self._beside(i, k): j for (i, k), j in corners.items()}
-        for (i, k), j in corners.items():
-            image[j] = ends.get(self._beside(i, k, twins=True), j)
-        rings = {circle.key: self.of_circles + 3 * k for k, circle in enumerate(self.circles)}
-        for k, circle in enumerate(self.circles):
-            if (twin := rings.get(circle.twin)) is not None:
-                j = self.of_circles + 3 * k
-                image[j : j + 3], sign[j + 1] = twin + np.arange(3), -1.0
-        first = np.minimum(image, np.arange(count))
-        held = (image == np.arange(count)) & (sign < 0.0)
+        every, named = np.arange(count), list(self._names)
+        at = {name: j for j, (name, _, _) in enumerate(named)}
+        image = np.array([at.get(twin, j) for j, (_, twin, _) in enumerate(named)], dtype=int)
+        sign = np.array([sign if twin in at else 1.0 for _, twin, sign in named])
+        held = (image == every) & (sign < 0.0)
         if self.holds_radii:
             held[[*corners.values(), *range(self.of_circles + 2, count, 3)]] = True
-        rows = np.flatnonzero(~held)
-        names, column = np.unique(first[rows], return_inverse=True)
-        T = np.zeros((count, len(names)))
-        T[rows, column] = np.where(rows == names[column], 1.0, sign[rows])
+        first, rows = np.minimum(image, every), np.flatnonzero(~held)
+        known, column = np.unique(first[rows], return_inverse=True)
+        T = np.zeros((count, len(known)))
+        T[rows, column] = np.where(rows == known[column], 1.0, sign[rows])
         half = np.ones(count)
         for key, j in sides.items():
             half[j + 1] = 0.5 * self.lengths[key]
         return T / (np.abs(T) * half[:, None]).max(axis=0, initial=1e-9)
 
-    def _beside(self, i: int, k: int, twins: bool = False) -> tuple[int, int]:
-        """Return the keys of the sides before and after a corner, or those of its mirror image."""
-        before, after = self.loops[i].sides[k - 1], self.loops[i].sides[k]
-        return (after.twin, before.twin) if twins else (before.key, after.key)
+    @property
+    def _names(self) -> Iterator[tuple[tuple[Any, Any], tuple[Any, Any], float]]:
+        """The name of every q, that of its mirror image, and which sign it has there."""
+        for loop in self.loops:
+            for side in loop.sides:
+                if side.free:
+                    yield (side.key, "offset"), (side.twin, "offset"), 1.0
+                    yield (side.key, "turn"), (side.twin, "turn"), -1.0
+            for k, corner in enumerate(loop.corners):
+                if corner.radius > 0.0:
+                    before, after = loop.sides[k - 1], loop.sides[k]
+                    yield (before.key, after.key), (after.twin, before.twin), 1.0
+        for circle in self.circles:
+            for name, sign in (("x", 1.0), ("y", -1.0), ("radius", 1.0)):
+                yield (circle.key, name), (circle.twin, name), sign
 
     @cached_property
     def lengths(self) -> dict[tuple[int, int], float]:
@@ -518,15 +484,14 @@ def _enclosed(loop: tuple[Piece, ...]) -> float:
 def _side(side: Side, first: _Touch, last: _Touch, i: int, k: int) -> Placed:
     """Return the piece of a side between where the fillets at its ends touch it."""
     if side.curve is None or isinstance(side.curve, Line):
-        line = Line(first.point, last.point)
-        piece = Piece(line, side.label, side.free)
-        return Placed(piece, LineMoves(first.by_point, last.by_point), i, k)
+        piece = Piece(Line(first.point, last.point), side.label, side.free)
+        return Placed(piece, np.vstack([first.by_point, last.by_point]), i, k)
     curve = between(side.curve, first.point, last.point)
     ends = [
         d @ touch.by_point / (d @ d)
         for touch, d in zip((first, last), curve.derivative(np.array([0.0, 1.0])), strict=True)
     ]
-    return Placed(Piece(curve, side.label), OwnMoves(ends[0], ends[1]), i, k)
+    return Placed(Piece(curve, side.label), np.array(ends), i, k)
 
 
 def between(curve: Curve, start: np.ndarray, end: np.ndarray) -> Curve:

@@ -110,7 +110,7 @@ class SolidPart:
         """Of the part, m3; of an extruded one that within its curves."""
         if self.flat is None:
             return self.surface.volume
-        return self.flat.shape.area * self.flat.domain.thickness
+        return self.flat.volume
 
     @cached_property
     def cavities(self) -> np.ndarray:
@@ -120,15 +120,9 @@ class SolidPart:
     @property
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
-        domain, result = self.domain, []
-        result += domain.gray_words
-        if self.pieces:
-            pieces = "1 piece" if self.pieces == 1 else f"{self.pieces} pieces"
-            share = 100.0 * self.pieces_volume / domain.volume
-            result.append(
-                f"arm {domain.name!r}: {pieces} without a joint to both interfaces "
-                f"({1e9 * self.pieces_volume:.3g} mm3, {share:.2g} % of the volume) left out"
-            )
+        domain = self.domain
+        lost = domain.left_out_words(self.pieces, self.pieces_volume, 3)
+        result = [*domain.gray_words, *lost]
         if len(self.cavities):
             places = "; ".join("({:.1f}, {:.1f}, {:.1f})".format(*at) for at in MM * self.cavities)
             result.append(

@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.spatial import cKDTree
 
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.checks import cell_sizes
@@ -281,8 +280,6 @@ PASSES, STEPS, RIPPLES = 40, 0.03, 0.15
 FURTHEST = 0.4  # of a cell that smoothing moves a point
 ROOM = 0.5  # and of its distance from the arm's own faces
 CORRECTIONS, SAME_VOLUME = 20, 1e-9  # Newton's steps; relative
-MANY = 3_000  # edges that are looked at together, with some 60 triangles near each
-TOUCHES = 1e-9  # of an edge and of a triangle: what only touches does not cross
 
 
 def smooth_surface(
@@ -386,25 +383,30 @@ def crossings(surface: Surface) -> np.ndarray:
     Edges that have a corner in common with a triangle do not count, and neither does what only
     touches, as pieces of material that meet in a point.
     """
-    corners, triangles = surface.corners, surface.triangles
+    import pyvista
+    from vtkmodules.vtkCommonCore import vtkIdList
+
+    points, triangles = surface.points, surface.triangles
     edges = edges_of(triangles)
     _, first = np.unique(np.sort(edges, axis=1), axis=0, return_index=True)
-    edges, owners = edges[first], first // 3
-    start, end = surface.points[edges].swapaxes(0, 1)
-    centres = corners.mean(axis=1)
-    radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
-    result = []
-    tree, middle = cKDTree(centres), 0.5 * (start + end)
-    reach = 0.5 * np.linalg.norm(end - start, axis=1) + radii.max(initial=0.0)
-    for part in np.array_split(np.arange(len(edges)), 1 + len(edges) // MANY):
-        near = tree.query_ball_point(middle[part], reach[part])
-        edge = np.repeat(part, [len(item) for item in near])
-        triangle = np.concatenate([*near, []]).astype(int)
-        apart = (edges[edge][:, :, None] != triangles[triangle][:, None]).all(axis=(1, 2))
-        edge, triangle = edge[apart], triangle[apart]
-        through = _passes(start[edge], end[edge], corners[triangle])
-        result.append(np.column_stack([owners[edge[through]], triangle[through]]))
-    return np.concatenate(result) if result else np.empty((0, 2), dtype=int)
+    locator = locator_of(pyvista.PolyData.from_regular_faces(points, triangles))
+    hit, pairs = vtkIdList(), list[tuple[int, int]]()
+    for k, (start, end) in zip(first.tolist(), points[edges[first]], strict=True):
+        locator.IntersectWithLine(start, end, 0.0, None, hit)
+        pairs += [(k, hit.GetId(i)) for i in range(hit.GetNumberOfIds())]
+    edge, triangle = np.array(pairs, dtype=int).reshape(-1, 2).T
+    apart = (edges[edge][:, :, None] != triangles[triangle][:, None]).all(axis=(1, 2))
+    return np.column_stack([edge // 3, triangle])[apart]
+
+
+def locator_of(triangles: Any) -> Any:
+    """Return what finds where lines pass through triangles, both of VTK."""
+    from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
+
+    result = vtkStaticCellLocator()
+    result.SetDataSet(triangles)
+    result.BuildLocator()
+    return result
 
 
 def open_edges(surface: Surface) -> np.ndarray:
@@ -449,31 +451,6 @@ def check_surface(name: str, surface: Surface) -> None:
         "mm; optimise with larger members (design.filter_radius), and with "
         'design.projection = "robust" until the design is crisp'
     )
-
-
-def _passes(start: np.ndarray, end: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Tell which segments pass through their triangles (n, 3, 3), off all edges and ends."""
-    # Möller & Trumbore (1997), doi:10.1080/10867651.1997.10487468.
-    along = end - start
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    to = start - corners[:, 0]
-    normal = np.cross(along, second)
-    det = np.einsum("na,na->n", first, normal)
-    size = np.linalg.norm(along, axis=1) * np.linalg.norm(np.cross(first, second), axis=1)
-    flat = np.abs(det) <= TOUCHES * size  # parallel
-    det = np.where(flat, 1.0, det)
-    across = np.cross(to, first)
-    u = np.einsum("na,na->n", to, normal) / det
-    v = np.einsum("na,na->n", along, across) / det
-    t = np.einsum("na,na->n", second, across) / det
-    inside = (
-        (u > TOUCHES)
-        & (v > TOUCHES)
-        & (u + v < 1.0 - TOUCHES)
-        & (t > TOUCHES)
-        & (t < 1.0 - TOUCHES)
-    )
-    return np.asarray(inside & ~flat)
 
 
 FINE, NEAR = 1e-6, 1e-3  # of the level; relative difference of volumes that will do

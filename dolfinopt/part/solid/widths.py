@@ -14,7 +14,7 @@ import numpy as np
 from dolfinopt.density.members import WIDE
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.plane.limits import FACING
-from dolfinopt.part.solid.surface import Surface
+from dolfinopt.part.solid.surface import Surface, locator_of
 
 SPACINGS, MOST_POINTS = 5.0, 50_000  # points of the surface in a cell's length; in all, about
 
@@ -70,12 +70,8 @@ def _narrowest(
         sense: 1 where rays leave the material there, -1 where they enter it.
     """
     from vtkmodules.vtkCommonCore import mutable
-    from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
-    locator = vtkStaticCellLocator()
-    locator.SetDataSet(triangles)
-    locator.BuildLocator()
-    normal = triangles.face_normals
+    locator, normal = locator_of(triangles), triangles.face_normals
     t: Any = mutable(0.0)
     cell: Any = mutable(0)
     hit: tuple[Any, ...] = (0.0, t, [0.0] * 3, [0.0] * 3, mutable(0), cell)
