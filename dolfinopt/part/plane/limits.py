@@ -72,6 +72,7 @@ class Limits:
         tool: least radius of concave corners, m.
         member, gap: least widths, m.
         arm, stays: where material may be, and where it must be (shapely).
+        scale: of the smallest arm that has this design.
     """
 
     cell: float
@@ -80,6 +81,7 @@ class Limits:
     gap: float
     arm: Geometry
     stays: Geometry
+    scale: float = 1.0
 
     def rows(self, sides: Sides) -> Rows:
         """Return g (m,), m, which must not be positive, and its derivatives (m, count) by x.
@@ -104,17 +106,25 @@ class Limits:
             yield reach * (turn - MOST_TURN), reach * slope
 
     def _of_pieces(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
-        """Yield the rows of lengths and radii."""
+        """Yield the rows of lengths and radii, as the smallest arm of the design needs them.
+
+        Arms of all sizes have the same radii: in smaller ones fillets leave less of their sides.
+        """
+        ratio = np.ones(sides.numbers[0])
+        if self.scale < 1.0:
+            ratio[list(sides.numbers[2].values())] /= self.scale
+            sides = with_radii(sides, lambda radius: radius / self.scale)
         for item in sides.placed:
             curve, moves = item.piece.curve, item.moves
             assert moves is not None
+            moves = moves * ratio
             if isinstance(curve, Line):
                 side = sides.loops[item.loop].sides[item.side]
                 d = unit(side.angle) if side.curve is None else direction(side.curve, 0.0)
                 length = float((curve.end - curve.start) @ d)
                 yield SHORT * self.cell - length, d @ (moves[:2] - moves[2:])
             elif isinstance(curve, Arc) and item.piece.free:
-                yield self.tool - curve.radius, -moves[2]
+                yield self.tool - self.scale * curve.radius, -self.scale * moves[2]
             else:
                 speed = np.linalg.norm(curve.derivative(GAUSS), axis=1)
                 ends = np.linalg.norm(curve.derivative(np.array([0.0, 1.0])), axis=1)
@@ -226,7 +236,8 @@ def limits_of_part(
     strips = [interface.buffer(LINK * domain.cell) for interface in interfaces(domain)]
     stays = shapely.union_all([domain.solid.area_inside(chord), *strips]).intersection(arm)
     member = (domain.minimum_member or THIN) / scale
-    return Limits(domain.cell, tool, member, max(2.0 * tool, minimum_gap) / scale, arm, stays)
+    gap = max(2.0 * tool, minimum_gap) / scale
+    return Limits(domain.cell, tool, member, gap, arm, stays, scale)
 
 
 def rounded_radii(sides: Sides, limits: Limits) -> Sides:
