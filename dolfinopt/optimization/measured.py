@@ -17,7 +17,9 @@ NEWTON_ITERATIONS = 100.0
 
 # -- The projection, and the price of limits (problem) --
 
-GENTLE = 16.0  # beta up to which steps are as long as `optimizer.move` allows
+# Final beta up to which steps are as long as `optimizer.move` allows. With 64 two arms fall apart
+# without shorter ones from a beta of 4 on.
+GENTLE = 16.0
 # Iterations in which beta doubles with which steps may get as short as `LEAST_REACH` meanwhile: the
 # merit rises then by itself, and makes them so. Within 8 iterations and with that length a design
 # falls apart, ten times as soft as with five times the length; it is five times as soft with three.

@@ -30,8 +30,9 @@ class Projection:
 
     @property
     def move(self) -> float:
-        """Move limit, shorter where the projection is steep and x_phys would leap."""
-        return self.scene.optimizer.move * min(1.0, GENTLE / self.beta)
+        """Move limit, shorter on the way to a sharp projection, where x_phys would leap."""
+        move, is_sharp = self.scene.optimizer.move, self.scene.design.sharpness > GENTLE
+        return move * min(1.0, (4.0 / self.beta) ** 0.5) if is_sharp else move
 
     @property
     def least_reach(self) -> float:

@@ -31,7 +31,7 @@ FOLLOWED = 6  # steps that a mesh follows
 # Relative fall of the objective, on new meshes, in so many steps as two of them follow, that ends
 # the search. By meshes alone it ended by chance where trust regions collapsed: a light arm at 1.08
 # or 1.14 kg, as the last digits would have it.
-SETTLED = 1e-2
+SETTLED = 5e-3
 MOST, OLD = 6, 5  # places that are differentiated in a step; steps that their rows hold
 ATTEMPTS, ENOUGH = 3, 0.3  # at a step of one radius; of the promised fall, that ends them
 PRICE, LEAST_PRICE, OVER = 1.5, 0.1, 3.0  # of limits over the objective: first; least; multiplier
