@@ -22,7 +22,7 @@ from dolfinopt.part.folder import Forms, Saved
 from dolfinopt.part.part import Curves, Meshes, mesh_parts
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
-from dolfinopt.part.plane.limits import limits_of_part, with_radii
+from dolfinopt.part.plane.limits import limits_of_part
 from dolfinopt.part.plane.part import PlanePart, make_part
 from dolfinopt.part.problem import Problem
 from dolfinopt.part.search import PRICE, Search
@@ -233,9 +233,7 @@ def _free(scene: Scene, k: int, part: Part, more: float = 1.0) -> FreeSides:
     limits = limits_of_part(flat.domain, tool, scene.design.minimum_gap, smallest)
     if more > 1.0:
         flat = replace(make_part(flat.domain, Curves(tool), more), tolerance=flat.tolerance)
-    # Radii are the same in all sizes: smaller ones leave room on the sides of the smallest.
-    sides = with_radii(flat.sides, lambda radius: max(tool, smallest * radius))
-    free = FreeSides(flat, sides, limits, part.domain if isinstance(part, SolidPart) else None)
+    free = FreeSides(flat, flat.sides, limits, part.domain if isinstance(part, SolidPart) else None)
     result = free.nearest()
     return free if result is None else result[0]
 
