@@ -269,9 +269,9 @@ class Descent:
         outlines: Outlines,
         iterations: int,
         tell: Tell,
-        number: int = 0,
-        keep: Callable[[Saved], None] = lambda _: None,
-        known: Saved | None = None,
+        number: int,
+        keep: Callable[[Saved], None],
+        known: Saved | None,
     ):
         """Begin at outlines, or where a search from them is known to have been."""
         self.iterations, self.tell, self.number, self.keep = iterations, tell, number, keep

@@ -65,11 +65,12 @@ class State:
     @property
     def values(self) -> np.ndarray:
         """What is minimised, and the relative constraints by their true values (1 + m,)."""
-        return np.append(self.against(self.held), self._worst)
+        return np.append(self.against(self.held), self.worst)
 
     @property
-    def _worst(self) -> list[float]:
-        return [max(self.places.values())] if self.places else []
+    def worst(self) -> float:
+        """The largest of `places`, -1 without any."""
+        return max(self.places.values(), default=-1.0)
 
     def against(self, held: np.ndarray) -> np.ndarray:
         """Return the same by smooth values and the smooth limits of another state."""
@@ -224,7 +225,7 @@ class Problem:
         """
         problem = replace(self, local={}, finer={})
         fine = problem.evaluated(state.outlines, {}, state.solutions)
-        if max(fine.places.values(), default=-1.0) < NEAR:
+        if fine.worst < NEAR:
             return problem, fine
         for _ in range(2):
             fresh, plain = fine, problem

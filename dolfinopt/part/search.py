@@ -301,8 +301,7 @@ class Search:
 
     def _merit(self, state: State, held: State) -> float:
         v, price = state.against(held.held), self.price * abs(held.values[0])
-        worst = max(state.places.values(), default=-1.0)
-        return float(v[0] + price * np.maximum(np.append(v[1:], worst), 0.0).sum())
+        return float(v[0] + price * np.maximum(np.append(v[1:], state.worst), 0.0).sum())
 
     def _led_to(self, state: State, x: np.ndarray) -> tuple[State, np.ndarray, bool] | None:
         """Return the state after a step, the whole step, and whether its meshes are new."""
