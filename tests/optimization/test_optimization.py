@@ -172,8 +172,8 @@ def test_projection_ends_crisp(kind, grayness):
     """From all grey to no grey with volumes kept, and as good as without a projection or better."""
     # Cut it is the same design, but for cells that meet in corners alone: cut it is without them.
     statics = ["objective.kind=static", "arms.cells=[60,8]", "design.filter_radius=0.025"]
-    projected = ["design.continuation=15", f"design.projection={kind}"]
-    result = do.optimize(small(*statics, *projected, iterations=250))
+    sharp = ["design.continuation=15", "design.sharpness=64", f"design.projection={kind}"]
+    result = do.optimize(small(*statics, *sharp, iterations=250))
     grey = do.optimize(small(*statics, iterations=30))
     if WORLD.rank == 0:
         last = result.history[-1]
