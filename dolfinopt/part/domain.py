@@ -64,7 +64,7 @@ class Edge:
 def loops(sides: np.ndarray) -> list[np.ndarray]:
     """Chain directed sides (n, 2) between nodes to closed loops; return the numbers of sides."""
     ahead: dict[int, list[int]] = {}
-    for number, node in enumerate(sides[:, 0].tolist()):
+    for number, node in enumerate(map(int, sides[:, 0])):
         ahead.setdefault(node, []).append(number)
     result = []
     while ahead:

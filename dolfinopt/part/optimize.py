@@ -13,7 +13,7 @@ import gc
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.errors import ConvergenceError, InputError
@@ -275,7 +275,8 @@ class Descent:
     ):
         """Begin at outlines, or where a search from them is known to have been."""
         self.iterations, self.tell, self.number, self.keep = iterations, tell, number, keep
-        self.best, self.forms = cast(Found | None, None), cast(Outlines, {})
+        self.best: Found | None = None
+        self.forms: Outlines = {}
         self.ending, done = "", 0
         if known is not None:
             problem = replace(problem, tightened=known.tightened)

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from dolfinopt.part.check import STRESS, Simulated, simulate_parts
-from dolfinopt.part.mesh import BodyMesh, PlateMesh
+from dolfinopt.part.mesh import PlateMesh
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.stress import HOT, CornerStress, OutlineStress
 from dolfinopt.profiling import Profile
@@ -22,13 +22,14 @@ from dolfinopt.responses.products import by_nodes
 from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress import arm_loads, maxima, motions_of
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.responses import limited_by
 
 if TYPE_CHECKING:
     from dolfinopt.part.part import Part, PartMesh
 
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
-NEAR = -0.2  # of the stress of a place: from there on a finer mesh is asked
+NEAR = -0.2  # from there on a limit has derivatives, the stress of a place a finer mesh
 
 Place = tuple[int, int]  # number of an arm, and of a piece of its outline
 
@@ -179,7 +180,8 @@ class Problem:
             motion = [load.coefficients for load in loads]
             stress = np.max([maxima(MPI.COMM_SELF, points.A, a)[0] for a in motion], axis=0)
             means_of = points.means(motion, self._exponent)
-            face = _face(state.bodies[k])
+            body = state.bodies[k]
+            face = body.face if isinstance(body, PlateMesh) else body
             near = cKDTree(face.points[face.sides[:, 0]]).query(points.places[:, :2])[1]
             counts = part.regular(points.places, scene.objective.stress_margin)
             owners[k] = np.where(counts & (points.weights > 0.0), face.owners[near], -1)
@@ -271,11 +273,14 @@ class Problem:
     def slopes(self, state: State) -> np.ndarray:
         """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""
         simulated = state.simulated
-        given = simulated.scene, simulated.partition, simulated.arms, simulated.trajectory
+        place = simulated.scene, simulated.partition, simulated.arms
+        given = *place, simulated.trajectory, Profile()
         sign = -1.0 if objective_of(self.scene).turned else 1.0
-        rows = [{k: sign * g for k, g in gradient(*given, Profile(), by=by_nodes).items()}]
+        rows = [{k: sign * g for k, g in gradient(*given, by_nodes).items()}]
         every = limits_of(simulated.scene, simulated.evaluation)
-        result = constraint_gradients(*given, measured=simulated.evaluation.responses, by=by_nodes)
+        measured = simulated.evaluation.responses
+        near = {limited_by(limit.quantity).name for limit in every if limit.excess > NEAR}
+        result = constraint_gradients(*given, measured, by_nodes, asked=near.__contains__)
         for limit, row in zip(every, result, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.items()})
@@ -294,8 +299,3 @@ class Problem:
             by_nodes = np.array([rows[number][k][order] for number in some])
             result[self.scene.patterns.get(k, k)][some] += every[k].by_x(body, by_nodes)
         return np.hstack([*result.values()])
-
-
-def _face(mesh: Any) -> BodyMesh:
-    """Return the triangles of a plate's mesh, in the plane or in space."""
-    return mesh.face if isinstance(mesh, PlateMesh) else mesh

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -99,7 +98,8 @@ class Search:
         self.problem, self.state, self.meshed = problem, state, state.outlines
         self.since, self.falls, self.steps = FOLLOWED, list[tuple[int, float]](), steps
         self.radius, self.price = FIRST_RADIUS, PRICE
-        self.H, self.curvature = np.zeros((0, 0)), cast(BFGS | None, None)
+        self.H = np.zeros((0, 0))
+        self.curvature: BFGS | None = None
         self.rows: dict[Place, tuple[np.ndarray, int]] = {}
         self.before: tuple[Step, Linear] | None = None
 

@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
     from dolfinopt.arms.design_state import DesignState
     from dolfinopt.dynamics.build import Trajectory
-    from dolfinopt.fem.stress import LoadFields
     from dolfinopt.part.domain import Domain, SolidDomain
     from dolfinopt.part.part import Part
     from dolfinopt.responses.response import Analysis
