@@ -22,14 +22,13 @@ from dolfinopt.responses.products import by_nodes
 from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress import arm_loads, maxima, motions_of
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.responses import limited_by
 
 if TYPE_CHECKING:
     from dolfinopt.part.part import Part, PartMesh
 
 RESERVE = 2e-3  # relative, of every limit: what a finer mesh adds hardly matters then
 PLACE_EXPONENT = 20.0  # of the p-mean over the nodes of one place
-NEAR = -0.2  # from there on a limit has derivatives, the stress of a place a finer mesh
+NEAR = -0.2  # of the stress of a place: from there on a finer mesh is asked
 
 Place = tuple[int, int]  # number of an arm, and of a piece of its outline
 
@@ -279,8 +278,7 @@ class Problem:
         rows = [{k: sign * g for k, g in gradient(*given, by_nodes).items()}]
         every = limits_of(simulated.scene, simulated.evaluation)
         measured = simulated.evaluation.responses
-        near = {limited_by(limit.quantity).name for limit in every if limit.excess > NEAR}
-        result = constraint_gradients(*given, measured, by_nodes, asked=near.__contains__)
+        result = constraint_gradients(*given, measured, by_nodes)
         for limit, row in zip(every, result, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.items()})
