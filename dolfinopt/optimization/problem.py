@@ -108,8 +108,9 @@ def binds(scene: Scene, variant: int, response: str) -> bool:
 
     Where limits are the nominal one's the eroded one keeps them, too, but for what depends on the
     phase of a vibration and so pulls either at random: with a limit on settling alone there is no
-    other. `scara.toml` ends at 0.512 kg, with that row of the eroded one at 0.531 to 0.543. That of
-    the volume is the nominal one's, with the gradient of the dilated one where members have widths.
+    other. With a sharpness of 128 `scara.toml` ends at 0.512 kg, with that row of the eroded one at
+    0.531 to 0.543. That of the volume is the nominal one's, with the gradient of the dilated one
+    where members have widths.
     """
     design, declared = scene.design, find(response).declared
     if variant == variants_of(scene)[-1]:
