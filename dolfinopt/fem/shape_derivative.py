@@ -35,7 +35,7 @@ from dolfinopt.fem.eshelby import (
 )
 from dolfinopt.fem.kernels import Values
 from dolfinopt.fem.laws import ROWS, SHEARS, VON_MISES
-from dolfinopt.fem.measured import KERNEL_CHUNK_ENTRIES
+from dolfinopt.fem.measured import DERIVATIVE_CHUNK_CELLS
 from dolfinopt.fem.tensors import (
     ElementTensors,
     corner_functions,
@@ -65,7 +65,7 @@ class ShapeDerivative:
     def stiffness(self, left: np.ndarray, right: np.ndarray, young: np.ndarray) -> np.ndarray:
         """Differentiate sum_k left_k' K right_k of nodal fields (n_nodes, d, k)."""
         operators, result = self._operators, np.zeros_like(self._operators.corners)
-        for part in self._runs(left.shape[2]):
+        for part in self._runs():
             points = self._stiffness_points(part)
             u, v = (points.gradients(*self._values(field, part)) for field in (left, right))
             result[part] = points.by_corners(young[part], self._energy(part, u, v))
@@ -99,7 +99,7 @@ class ShapeDerivative:
         operators, result = self._operators, np.zeros_like(self._operators.corners)
         by = 0.5 * (by_K0 + by_K0.swapaxes(1, 2)).reshape(len(by_K0), -1)
         rule = gauss_points(operators.cell, forms.geometric_degree(operators.cell))
-        for part in self._runs(sum(by.shape)):
+        for part in self._runs():
             points, values = GaussPoints(operators, part, *rule), self._values(fields, part)
             u, (H, _) = points.gradients(*values), points.gradients(*self._values(V, part))
             G = (by @ products_of_pairs(H)).reshape(u[0].shape)
@@ -122,7 +122,7 @@ class ShapeDerivative:
         by = by_stress.reshape(len(by_stress), len(self._coordinates), len(at), -1)
         by = np.tensordot(by, VON_MISES[self._cell.dim], (0, 0))  # by the stresses themselves
         operators, result = self._operators, np.zeros_like(self._operators.corners)
-        for part in self._runs(by.shape[2]):
+        for part in self._runs():
             points, values = GaussPoints(operators, part, at), self._values(fields, part)
             C, ones = of_cells(self._tangent, part), np.ones(len(by[part]))
             along = (by[part] @ C[:, None])[..., ROWS[operators.cell.dim]]
@@ -160,11 +160,10 @@ class ShapeDerivative:
         rule = gauss_points(cell, forms.stiffness_degree(cell))
         return GaussPoints(self._operators, part, *rule)
 
-    def _runs(self, columns: int) -> Iterator[slice]:
+    def _runs(self) -> Iterator[slice]:
         """Yield runs of cells that are in memory at once."""
-        count, nodes = self._operators.cells.shape
-        step = max(1, KERNEL_CHUNK_ENTRIES // (9 * nodes * columns))
-        return (slice(first, first + step) for first in range(0, count, step))
+        first = range(0, len(self._coordinates), DERIVATIVE_CHUNK_CELLS)
+        return (slice(k, k + DERIVATIVE_CHUNK_CELLS) for k in first)
 
     def _values(self, field: np.ndarray, part: slice) -> tuple[np.ndarray, np.ndarray]:
         """Return the nodal values (e, n, d, k) of a field and the amplitudes (e, m, k)."""

@@ -278,6 +278,7 @@ def node_places(cell: forms.Cell) -> np.ndarray:
     return np.asarray(_lagrange(cell, cell.degree).points)
 
 
+@cache
 def _lagrange(cell: forms.Cell, degree: int) -> Any:
     kind = getattr(basix.CellType, cell.shape)
     variant = basix.LagrangeVariant.gll_warped

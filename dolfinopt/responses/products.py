@@ -133,7 +133,8 @@ def by_nodes(state: DesignState, products: Products) -> np.ndarray:
         if len(geometric.by_K0):
             parts = geometric.loads.fields, geometric.modes, geometric.by_K0
             by_corners += shape.geometric_stiffness(*parts, young)
-    for left, right in stiffness:
+    if stiffness:
+        left, right = (np.concatenate(fields, axis=2) for fields in zip(*stiffness, strict=True))
         by_corners += shape.stiffness(left, right, young)
     for left, right in mass:
         by_corners += shape.mass(left, right, elastic.density)
