@@ -25,7 +25,7 @@ from dolfinopt.part.problem import NEAR, Place, Problem, State
 from dolfinopt.part.program import solve
 from dolfinopt.responses.constraints import EXCESS
 
-FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.5, 2.0, 0.005  # of the trust region, of FAR
+FIRST_RADIUS, LARGEST_RADIUS, LEAST_RADIUS = 0.5, 2.0, 0.001  # of the trust region, of FAR
 FOLLOWED = 6  # steps that a mesh follows
 # Relative fall of the objective, on new meshes, in so many steps as two of them follow, that ends
 # the search. By meshes alone it ended by chance where trust regions collapsed: a light arm at 1.08
