@@ -20,13 +20,13 @@ from dolfinopt.scene.tables.base import (
     Refusal,
     Table,
     cut,
+    input_error,
     key_text,
     one_line,
     shown,
     table_in,
     without_none,
 )
-from dolfinopt.scene.tables.closures import as_written
 from dolfinopt.scene.tables.joints import DRIVE_KEYS
 from dolfinopt.scene.tables.material import Material, check_material, material_keys
 from dolfinopt.scene.tables.responses import need_of
@@ -57,7 +57,7 @@ def first_problem(
     problems = [_problem(dict(item), tree) for item in error.errors(include_url=False)]
     # A misspelt key is also a missing one: the spelling is the message that helps.
     first = min(problems, key=lambda problem: not problem.unknown)
-    where = blamed(source, changes, (*first.locs, *(as_written(loc, tree) for loc in first.locs)))
+    where = blamed(source, changes, first.locs)
     return one_line(f"{where}: {first.text}")
 
 
@@ -100,7 +100,19 @@ def wrong_value(loc: Loc, tree: dict[str, Any]) -> str:
     return f"{_found(loc, tree)}: expected {allowed_words(field)} ({_meaning(field)})"
 
 
-def misplaced(node: Mapping[str, Any], model: type[Table] = Scene, loc: Loc = ()) -> Iterator[Loc]:
+def check_tables(tree: dict[str, Any], source: str, changes: Sequence[Override] = ()) -> None:
+    """Refuse what is no table where a scene has one; a name is one in place of [material].
+
+    Raises:
+        InputError: there is such a value.
+    """
+    if isinstance(tree.get("material"), str):
+        tree["material"] = {"name": tree["material"]}
+    for loc in _misplaced(tree):
+        raise input_error(blamed(source, changes, (loc,)), wrong_value(loc, tree))
+
+
+def _misplaced(node: Mapping[str, Any], model: type[Table] = Scene, loc: Loc = ()) -> Iterator[Loc]:
     """Yield where a scene's data has something else than its tables and arrays of them."""
     for key, value in node.items():
         field = model.model_fields.get(key)
@@ -114,7 +126,7 @@ def misplaced(node: Mapping[str, Any], model: type[Table] = Scene, loc: Loc = ()
         for i, row in enumerate(value if array else [value]):
             at = (*loc, key, i) if array else (*loc, key)
             if isinstance(row, dict):
-                yield from misplaced(row, table, at)
+                yield from _misplaced(row, table, at)
             else:
                 yield at
 
@@ -249,7 +261,6 @@ def value_at(loc: Loc, tree: Any) -> tuple[Any, bool]:
 
 def dotted(loc: Loc, tree: dict[str, Any]) -> str:
     """Return the TOML spelling of a path, with the name of the arm it belongs to."""
-    loc = as_written(loc, tree)
     text = ".".join(map(key_text, loc))
     named = loc[0] in ("arms", "joints", "closures", "forces") and len(loc) > 1
     name = arm_name(tree, loc[1], loc[0]) if named else None
@@ -295,27 +306,28 @@ def _describe(model: type[Table], prefix: str) -> Iterator[KeyInfo]:
         below, path = table_in(field.annotation), f"{prefix}{key}"
         if below is not None:
             yield from _describe(below, f"{path}.")
-        elif not is_explained_elsewhere(path):
+        elif not _explained_at(path):
             default = "" if field.is_required() else shown(field.default)
             default = "none" if default == "None" else default
-            also = tuple(item for item in ("arms", "joints") if _explains(path, f"{item}.{key}"))
+            tables = ("arms", "joints", "closures")
+            also = tuple(item for item in tables if _explained_at(f"{item}.{key}") == prefix[:-1])
             told = allowed_words(field), default, str(field.description)
             yield KeyInfo(path, *told, also)
 
 
-def is_explained_elsewhere(path: str) -> bool:
-    """Return whether a key means what that of another table means, where it is explained.
+def _explained_at(path: str) -> str:
+    """Return the table at which a key is explained that means the same in another one.
 
     Arms state their own material, and [[joints]] the drives that arms state in the plane.
     """
     table, _, key = path.rpartition(".")
-    return (table == "arms" and key in material_keys()) or (table == "joints" and key in DRIVE_KEYS)
-
-
-def _explains(path: str, other: str) -> bool:
-    """Return whether what one key means is told at another one."""
-    place = {"arms": "material", "joints": "arms"}[other.partition(".")[0]]
-    return path.rpartition(".")[0] == place and is_explained_elsewhere(other)
+    same = {
+        "arms": ("material", material_keys()),
+        "joints": ("arms", DRIVE_KEYS),
+        "closures": ("joints", ("name", "rpy")),
+    }
+    place, keys = same.get(table, ("", ()))
+    return place if key in keys else ""
 
 
 # -- what a scene does not state and its results depend on --------------------------------------

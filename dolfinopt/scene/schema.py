@@ -19,7 +19,7 @@ from dolfinopt import version
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
-from dolfinopt.scene.tables.arms import Arm
+from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, setting, table_in
 from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
@@ -364,6 +364,8 @@ class Scene(Table):
         # Not by min_length: pydantic would also count arms that are there but invalid as absent.
         if not arms:
             raise ValueError
+        if len(arms) > MAX_ARMS:
+            raise Refusal(f"expected at most {MAX_ARMS} of them, found {len(arms)}")
         result: dict[str | None, Arm] = {}
         for arm in arms:  # those of one name are refused later
             result[arm.name] = arm.like(result.get(arm.design))

@@ -192,5 +192,6 @@ def test_regions_of_solids_have_a_depth(symmetric):
     ],
 )
 def test_depths_that_cannot_be(region, word):
-    changes = f"arms.link1.regions=[{region}]", f"arms.extruded={str(word == 'extruded').lower()}"
+    design = "extruded" if word == "extruded" else "false"
+    changes = f"arms.link1.regions=[{region}]", f"arms.symmetric={design}"
     refusal(lambda: do.load_scene(SPACE, (*BLOCK, *changes)), word)

@@ -63,7 +63,7 @@ class Joint(Drive):
     USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"), *OF_PARTS)
 
     name: Annotated[str, AfterValidator(check_joint_name)] = setting(
-        "unique name, the column of its coordinate in tables [-]"
+        "unique name, the column of its coordinate in tables, of a rod without length of that [-]"
     )
     type: JointType = setting("what moves: an angle, a distance, or nothing [-]")
     parent: str = setting(

@@ -395,28 +395,21 @@ class Simulation(Table):
 
 SHIFTS, BAND = (0.0,), (0.0, 50.0)  # Hz; defaults
 ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
-Coordinates = Annotated[int, Field(ge=1)] | Literal["auto"]
+ReductionError = Annotated[float, Field(ge=1e-6, le=0.5)]
+Coordinates = Annotated[int, Field(ge=1)] | ReductionError | Literal["auto"]
 
 
 class Reduction(Table):
     """Model reduction of every arm."""
 
-    USES = (
-        Use("frequencies", "method", "krylov balanced"),
-        Use("tolerance", "coordinates", "auto"),
-    )
+    USES = (Use("frequencies", "method", "krylov balanced"),)
 
     method: ReductionMethod = setting("craig-bampton", "method of model reduction [-]")
     coordinates: Coordinates = setting(
         4,
-        'number of elastic coordinates q of each arm; "auto": the smallest number '
-        "that meets reduction.tolerance; default in space: 6 for each outboard interface [-]",
-    )
-    tolerance: float = setting(
-        1e-3,
-        'with "auto": allowed relative error of the reduction, energy norm [-]',
-        ge=1e-6,
-        le=0.5,
+        "number of elastic coordinates q of each arm; or the relative error of the reduction, "
+        'energy norm, which the smallest number meets, "auto" being 0.001; default in space: 6 for '
+        "each outboard interface [-]",
     )
     frequencies: tuple[Frequency, ...] | None = setting(
         None,
@@ -446,7 +439,7 @@ class Reduction(Table):
     def check_table(self) -> None:
         """Refuse frequencies and numbers of coordinates that the method cannot have."""
         self._check_frequencies()
-        if self.coordinates == "auto" or self.count >= self.fewest:
+        if not self.count or self.count >= self.fewest:
             return
         if self.method == "craig-bampton":
             raise Refusal(
@@ -465,8 +458,13 @@ class Reduction(Table):
 
     @property
     def count(self) -> int:
-        """The stated number of coordinates; 0 with "auto"."""
-        return 0 if self.coordinates == "auto" else self.coordinates
+        """The stated number of coordinates; 0 where it follows from an error."""
+        return self.coordinates if isinstance(self.coordinates, int) else 0
+
+    @property
+    def tolerance(self) -> float:
+        """The relative error that the smallest number of coordinates is to meet."""
+        return self.coordinates if isinstance(self.coordinates, float) else 1e-3
 
     @property
     def fewest(self) -> int:

@@ -27,7 +27,6 @@ from dolfinopt.scene.tables.responses import (
     LARGEST_LOAD,
     Declaration,
     Direction,
-    Frequency,
     Need,
     StiffnessCase,
     asked,
@@ -49,7 +48,6 @@ else:  # the words of the responses that are declared
 GradientKind = Literal["esl", "exact"]
 Attached = Literal["rigid-body", "point-mass", "none"]
 Combination = Literal["sum", "worst"]
-WorstBy = Literal["compliance", "deviation"]
 MANY_CASES = 1000  # load cases that a motion may have however short it is
 Load = Three[float]  # F_x N, F_y N, moment N m
 SpatialLoad = Six[float]  # force N, moment N m
@@ -84,9 +82,6 @@ class Objective(Table):
         "number of load cases: the worst instant of each of so many equal intervals "
         "of the horizon [-]",
         ge=1,
-    )
-    worst: WorstBy = setting(
-        "compliance", "quantity that decides which instant of an interval is the worst [-]"
     )
     gradient: GradientKind = setting(
         "exact",
@@ -312,10 +307,6 @@ class ConstraintOptions(Table):
     settling_after: Instant = setting(
         0.0, "time from the beginning of each rest after which settling counts [s]"
     )
-    damping_below: Frequency | None = setting(
-        None,
-        "frequency below which poles count for constraints.damping_ratio; default: all do [Hz]",
-    )
     poles_at: tuple[Instant, ...] | None = setting(
         None, "instants at which poles count; default: start, middle and end of the motion [s]"
     )
@@ -368,11 +359,9 @@ class ConstraintOptions(Table):
     def _check_poles(self, scene: Scene) -> None:
         """Refuse responses of poles without a closed loop, and options of none."""
         used = [response.name for response in asked(scene) if "poles_at" in response.options]
-        options = ("damping_below", "poles_at")
-        for key in unused_options(options, scene.objective.kind, self.limits):
-            users = " or ".join(f"constraints.{name}" for name in users_of(key)[1])
-            self.refuse_stated(f".{key}", f"without {users}: nothing else uses it")
         if not used:
+            reason = "without constraints.damping_ratio or pole_frequency: nothing else uses it"
+            self.refuse_stated(".poles_at", reason)
             return
         where = f".{used[0]}" if used[0] in self.limits else "objective.kind"
         if scene.control is None:

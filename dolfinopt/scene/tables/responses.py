@@ -203,7 +203,6 @@ DECLARED: dict[str, Declaration] = {
                 "compliance",
                 options=(),
             ),
-            options=("worst",),
             file="motion",
         ),
         Declaration("integral_compliance", "integral of the compliance", "N m s", file="motion"),
@@ -324,7 +323,7 @@ DECLARED: dict[str, Declaration] = {
                 Ratio,
                 lower=True,
             ),
-            options=("poles_at", "damping_below"),
+            options=("poles_at",),
             stands_for="least damping ratio",
             natural="maximize",
             exact=True,
@@ -415,10 +414,6 @@ VOLUME = Declaration(
     of_nominal=True,
     file="static",
 )
-
-# Older words of objective.kind and keys of [constraints].
-OLD_KINDS = {"compliance": "integral_compliance", "first_frequency": "eigenfrequency"}
-OLD_LIMITS = {"esl": "compliance"}
 
 
 def objective_kinds() -> list[str]:
