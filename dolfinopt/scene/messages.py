@@ -6,14 +6,13 @@ import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+from typing import Annotated, Any, NamedTuple, get_origin
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from dolfinopt.progress import with_unit
-from dolfinopt.scene.schema import Scene
+from dolfinopt.scene.schema import Scene, TomlSchema
 from dolfinopt.scene.tables.arms import Arm, check_arm_name
 from dolfinopt.scene.tables.base import (
     Loc,
@@ -28,10 +27,10 @@ from dolfinopt.scene.tables.base import (
     without_none,
 )
 from dolfinopt.scene.tables.joints import DRIVE_KEYS
-from dolfinopt.scene.tables.material import Material, check_material, material_keys
+from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.responses import need_of
 
-_COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
+COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
 
 
 @dataclass(frozen=True)
@@ -195,52 +194,49 @@ def unit_of(field: FieldInfo) -> str:
 
 def allowed_words(field: FieldInfo) -> str:
     """Return in words what `field` accepts."""
-    return _allowed_type(field.annotation, field.metadata)
+    kind: Any = field.annotation
+    schema = TypeAdapter(Annotated[(kind, *field.metadata)] if field.metadata else kind)
+    node = schema.json_schema(schema_generator=TomlSchema)
+    words = _words(node, node.get("$defs", {}))
+    if kind is Material:
+        return f"the name of a material, or {words}"
+    return f"{words} [[arms]], at least one" if table_in(kind) is Arm else words
 
 
-def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "") -> str:
-    annotation = without_none(annotation)
-    origin, args = get_origin(annotation), get_args(annotation)
-    if annotation is str and any(
-        getattr(rule, "func", None) is check_material for rule in metadata
-    ):
-        return "the name of a material of the catalogue"
-    if origin is Annotated:
-        rules = [rule for item in args[1:] for rule in getattr(item, "metadata", None) or [item]]
-        return _allowed_type(args[0], rules, plural)
-    if origin in (Union, UnionType):
-        kinds = [kind for kind in args if kind is not type(None)]
-        return " | ".join(_allowed_type(kind, metadata) for kind in kinds)
-    if origin is Literal:
-        return " | ".join(shown(value) for value in args)
-    if origin is tuple and table_in(annotation):
-        if table_in(annotation) is Arm:
-            return "an array of tables [[arms]], at least one"
-        return "an array of tables"
-    if origin is tuple:
-        rows = [kind for kind in (args[0], *get_args(args[0])) if get_origin(kind) is tuple]
-        inner = _allowed_type(args[0], plural="s")
-        if rows:  # of a union the shortest
-            inner = f"arrays of {_COUNTS[len(get_args(rows[0]))]} numbers"
-        count = "" if args[-1] is Ellipsis else f"{_COUNTS[len(args)]} "
-        return f"an array of {count}{inner}"
-    if annotation is Material:
-        return (
-            f"the name of a material, or a table with the keys {', '.join(Material.model_fields)}"
-        )
-    if isinstance(annotation, type) and issubclass(annotation, Table):
-        return f"a table with the keys {', '.join(annotation.model_fields)}"
-    nouns = {float: "a number", int: "an integer", str: "a string", bool: "true or false"}
-    noun = nouns[annotation]
-    noun = noun.split()[1] + plural if plural else noun
-    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-    bounds = [
-        f"{sign} {getattr(rule, name):.12g}"
-        for rule in metadata
-        for name, sign in signs.items()
-        if hasattr(rule, name)
-    ]
-    return " ".join([noun, " and ".join(bounds)]).strip()
+def _words(node: dict[str, Any], tables: dict[str, Any]) -> str:
+    """Return in words what a part of a JSON schema accepts."""
+    node = tables.get(node.get("$ref", "").rpartition("/")[2], node)
+    if "properties" in node:
+        return f"a table with the keys {', '.join(node['properties'])}"
+    if "description" in node:
+        return str(node["description"])
+    if "anyOf" in node:
+        return " | ".join(_words(item, tables) for item in node["anyOf"])
+    if "enum" in node or "const" in node:
+        return " | ".join(map(shown, node.get("enum", [node.get("const")])))
+    if node["type"] == "array":
+        return f"an array of {_elements(node['items'])}"
+    noun = {"number": "a number", "integer": "an integer", "string": "a string"}
+    return f"{noun.get(node['type'], 'true or false')}{_bounds(node)}"
+
+
+def _elements(items: Any) -> str:
+    """Return in words what stands in an array: elements in their order, or alike."""
+    count = f"{COUNTS[len(items)]} " if isinstance(items, list) else ""
+    first = items[0] if isinstance(items, list) else items
+    if "$ref" in first:
+        return "tables"
+    for kind in first.get("anyOf", [first]):  # of a union the shortest
+        if kind["type"] == "array":
+            return f"{count}arrays of {COUNTS[len(kind['items'])]} numbers"
+    return f"{count}{first['type']}s{_bounds(first)}"
+
+
+def _bounds(node: dict[str, Any]) -> str:
+    """Return the range of a number, e.g. " >= 0 and < 1"."""
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+    bounds = [f" {sign} {node[key]:.12g}" for key, sign in signs.items() if key in node]
+    return " and".join(bounds)
 
 
 def _found(loc: Loc, tree: dict[str, Any]) -> str:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 from pydantic import AfterValidator, Field, PrivateAttr, field_validator
+from pydantic.json_schema import GenerateJsonSchema
 
 from dolfinopt import version
 from dolfinopt.data import mesh_folder
@@ -411,7 +412,9 @@ def scene_schema() -> dict[str, Any]:
 
     It knows keys, types and ranges; what depends on several keys is checked when a scene is read.
     """
-    schema = _plain(Scene.model_json_schema(ref_template="#/definitions/{model}"))
+    schema = Scene.model_json_schema(
+        ref_template="#/definitions/{model}", schema_generator=TomlSchema
+    )
     schema["definitions"] = schema.pop("$defs")
     schema["required"].remove("name")  # by default the file's
     schema["properties"]["arms"]["minItems"] = 1
@@ -427,28 +430,33 @@ def scene_schema() -> dict[str, Any]:
         "anyOf": [{"type": "string", "enum": list(CATALOGUE)}, schema["properties"]["material"]]
     }
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "scene of dolfinopt"}
-    return head | {key: value for key, value in schema.items() if key != "title"}
+    return head | schema
 
 
-def _plain(node: Any) -> Any:
-    """Return a part of pydantic's schema without null, which TOML lacks, and in draft 7's words."""
-    if isinstance(node, list):
-        return [_plain(item) for item in node]
-    if not isinstance(node, dict):
-        return node
-    if "anyOf" in node:
-        kinds = [kind for kind in node["anyOf"] if kind != {"type": "null"}]
-        rest = {key: value for key, value in node.items() if key != "anyOf"}
-        node = rest | (kinds[0] if len(kinds) == 1 else {"anyOf": kinds})
-    result = {}
-    for key, value in node.items():
-        if key == "properties":
-            result[key] = {name: _plain(item) for name, item in value.items()}
-        elif key == "prefixItems":
-            result["items"] = _plain(value)
-        elif key != "title" and (key, value) != ("default", None):
-            result[key] = _plain(value)
-    return result
+class TomlSchema(GenerateJsonSchema):
+    """JSON schema without null, which TOML lacks, and titles, and in the words of draft 7."""
+
+    def nullable_schema(self, schema: Any) -> dict[str, Any]:
+        return self.generate_inner(schema["schema"])
+
+    def tuple_schema(self, schema: Any) -> dict[str, Any]:
+        result = super().tuple_schema(schema)
+        if "prefixItems" in result:
+            result["items"] = result.pop("prefixItems")
+        return result
+
+    def default_schema(self, schema: Any) -> dict[str, Any]:
+        result = super().default_schema(schema)
+        if result.get("default", 0) is None:
+            del result["default"]
+        return result
+
+    def model_schema(self, schema: Any) -> dict[str, Any]:
+        result = super().model_schema(schema)
+        return {key: value for key, value in result.items() if key != "title"}
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
 
 
 def flattened(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:

@@ -44,7 +44,9 @@ def check_material(name: str) -> str:
 CatalogueName = Annotated[
     str,
     AfterValidator(check_material),
-    WithJsonSchema({"type": "string", "enum": list(CATALOGUE)}),
+    WithJsonSchema(
+        {"enum": list(CATALOGUE), "description": "the name of a material of the catalogue"}
+    ),
 ]
 
 
