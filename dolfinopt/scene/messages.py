@@ -41,26 +41,20 @@ class Override:
     locs: tuple[Loc, ...]
 
 
-class _Problem(NamedTuple):
-    """One rejected key: what to print, and the paths of all keys involved, reported one first."""
-
-    text: str
-    locs: tuple[Loc, ...]
-    unknown: bool = False
+UNKNOWN = ("extra_forbidden", "invalid_key")  # pydantic's types of errors
 
 
 def first_problem(
     error: ValidationError, tree: dict[str, Any], source: str, changes: list[Override]
 ) -> str:
     """Return the one-line message of the first problem."""
-    problems = [_problem(dict(item), tree) for item in error.errors(include_url=False)]
     # A misspelt key is also a missing one: the spelling is the message that helps.
-    first = min(problems, key=lambda problem: not problem.unknown)
-    where = blamed(source, changes, first.locs)
-    return one_line(f"{where}: {first.text}")
+    errors = error.errors(include_url=False)
+    text, *locs = _problem(dict(min(errors, key=lambda item: item["type"] not in UNKNOWN)), tree)
+    return one_line(f"{blamed(source, changes, locs)}: {text}")
 
 
-def blamed(source: str, changes: Sequence[Override], locs: tuple[Loc, ...]) -> str:
+def blamed(source: str, changes: Sequence[Override], locs: Sequence[Loc]) -> str:
     """Return the place to blame for the values at `locs`: the file, or the last --set of them."""
     where = source
     for change in changes:
@@ -69,28 +63,27 @@ def blamed(source: str, changes: Sequence[Override], locs: tuple[Loc, ...]) -> s
     return where
 
 
-def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
-    """Translate one of pydantic's errors."""
+def _problem(item: dict[str, Any], tree: dict[str, Any]) -> tuple[Any, ...]:
+    """Return what one of pydantic's errors means, and the paths of all keys involved."""
     raw: Loc = item["loc"]
     loc = _key_loc(raw)
-    if item["type"] in ("extra_forbidden", "invalid_key"):
+    if item["type"] in UNKNOWN:
         model = model_at(loc[:-1])
-        fields = model.model_fields if model else {}
-        return _Problem(unknown_key(loc[:-1], loc[-1], fields, tree), (loc,), True)
+        return unknown_key(loc[:-1], loc[-1], model.model_fields if model else (), tree), loc
     if item["type"] == "missing" and len(raw) == len(loc):
         field = field_at(loc)
         text = f"missing key {dotted(loc, tree)} ({_meaning(field)})"
         if field.examples:
             text = f"missing table [{loc[-1]}] ({_meaning(field)}); write {field.examples[0]}"
-        return _Problem(text, (loc,))
+        return text, loc
     reason = item.get("ctx", {}).get("error")
     if isinstance(reason, Refusal):
-        locs = tuple((*loc, *key) for key in reason.keys) or (loc,)
-        return _Problem(f"{_found(locs[0], tree)}: {reason.reason}", locs)
+        locs = [(*loc, *key) for key in reason.keys] or [loc]
+        return f"{_found(locs[0], tree)}: {reason.reason}", *locs
     text = wrong_value(loc, tree)
     if item["type"] == "finite_number":
         text = text.replace(" number", " finite number")
-    return _Problem(text, (loc,))
+    return text, loc
 
 
 def wrong_value(loc: Loc, tree: dict[str, Any]) -> str:

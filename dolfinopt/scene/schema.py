@@ -218,11 +218,6 @@ class Scene(Table):
         return 3 if self.is_spatial else 2
 
     @property
-    def estimates_stiffening(self) -> bool:
-        """Whether its effect is told where it is stated; most of a solid arm's memory would go."""
-        return not self.is_spatial
-
-    @property
     def arm_sizes(self) -> tuple[str, ...]:
         """Keys of an arm that give its cells other sizes; in the plane thickness is a factor."""
         plane = ("length", "height", "mesh_size", "passive")

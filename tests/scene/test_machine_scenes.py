@@ -54,7 +54,7 @@ PRESCRIBED = [
     ("constraints.peak_force=[9.0]", "constraints.peak_force", "3 numbers, for cart, arm1, arm2"),
     (BALANCED, "constraints.effort=9", "reduction.method", "effort"),
     (EFFORT, KEPT, "objective.effort_weights=[1.0]", "effort_weights", "3 numbers, for cart, arm1"),
-    (EFFORT, KEPT, "objective.effort_weights=[0.0,0.0,0.0]", "effort_weights", "not all of them 0"),
+    (EFFORT, KEPT, "objective.effort_weights=[0.0,0.0,0.0]", "effort_weights", "above 0 for one"),
     (EFFORT, KEPT, BALANCED, 'objective.kind = "effort"', '"craig-bampton"'),
     # Without a limit of what arms do none of them would be left.
     (EFFORT, "constraints={mass=3.0}", 'kind = "effort"', "limit under [constraints]"),

@@ -222,7 +222,7 @@ SHOWN = [
     ("material.young_modulus", 10**400, "material.young_modulus = 2**1328...", "a number >= 1 and"),
     ("objective.load_cases", 16**5000, "objective.load_cases = 2**20000...", "at most 3000"),
     ("payload.mass", [[[[1.0]]]], "payload.mass = [[[...]]]", "a number >= 0"),
-    ("arms", {"name": "arm1"}, 'arms = {name = "arm1"}', "[[arms]], at least one"),
+    ("arms", {"name": "arm1"}, 'arms = { name = "arm1" }', "[[arms]], at least one"),
     ("arms.0.name", "ARM2", 'arms.1.name = "arm2"', "no other arm has"),
     ("arms.0.name", "arm2_face", 'arms.1.name = "arm2"', "both parts would have one name"),
     ("motion.path", "joints", "motion.file = None (default)", "a table (CSV)"),
@@ -322,7 +322,7 @@ CONTRADICTIONS = [
     (1, {"motion.base": "fixed"}, 'motion.base = "fixed"', '"cart" with one arm'),
     # Exact by default: the way out is told.
     (2, BALANCED | {"objective": {"kind": "integral_compliance"}}, "reduction.method",
-     'state objective.gradient = "esl"'),
+     'objective.gradient = "exact" (state "esl")'),
     *((2, KRYLOV | {"reduction.frequencies": twice}, "reduction.frequencies", "none of them twice")
       for twice in ([], [5.0, 5.0])),
     *((2, BALANCED | {"reduction.frequencies": one}, "reduction.frequencies", "the lower one first")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard
 
@@ -110,11 +111,18 @@ MAX_ARMS = 1000  # every arm is checked beside all others
 PART_FILES = ("_face", "_r12")  # behind an arm's name in files of its part
 STEP_FILES = (".step", ".stp")
 SID_FILES = (".sid", ".sid_fem")  # of this program and FEMBS, see `scene.sid`
-MESH_FILES = (".geo", ".msh", ".inp", *STEP_FILES, *SID_FILES)
+SIZE_KEYS = ("mesh_size", "cell_shape")
+# What files in place of cells say themselves.
+MESH_FILES: dict[str, tuple[str, ...]] = {
+    ".geo": (),
+    ".msh": SIZE_KEYS,
+    ".inp": SIZE_KEYS,
+    **dict.fromkeys(STEP_FILES, ("mesh_scale",)),
+    **dict.fromkeys(SID_FILES, (*SIZE_KEYS, "mesh_scale", "interface_offset")),
+}
 
 # What sits at an arm's ends; arms of one design may differ in it.
 JOINT_KEYS = ("joint_mass", "joint_inertia", *DRIVE_KEYS)
-SIZE_KEYS = ("mesh_size", "cell_shape")
 # What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
 MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset", "mesh_scale")
 # What an arm with a mesh of its own does not take.
@@ -475,11 +483,6 @@ class Arm(Drive):
             if self.hull is None:
                 self.refuse_stated("interface_offset", "without mesh: an arm of cells has no file")
             return
-        if self.sid is not None:
-            for key in ("mesh_scale", "interface_offset", *SIZE_KEYS):
-                self.refuse_stated(key, "with a body from a file", "mesh")
-        if self.mesh_scale != 1.0 and Path(self.mesh).suffix.lower() in STEP_FILES:
-            raise Refusal("expected none: a STEP file states its unit", "mesh_scale", "mesh")
         if self.interface_offset is not None and not self.is_solid:
             raise Refusal("expected only with the mesh of a solid arm", "interface_offset")
         if self.cells is not None:
@@ -497,14 +500,9 @@ class Arm(Drive):
         kind = Path(self.mesh).suffix.lower()
         if kind not in MESH_FILES:
             raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", "mesh")
-        for key in SIZE_KEYS:
-            told = key == "cell_shape" and self.cell_shape in SOLID_SHAPES
-            if kind in (".msh", ".inp") and getattr(self, key) is not None and not told:
-                raise Refusal(
-                    f"expected only with .geo or .step: a {kind} file has its cells",
-                    key,
-                    "mesh",
-                )
+        for key in MESH_FILES[kind]:
+            if key != "cell_shape" or not self.is_solid or self.sid:
+                self.refuse_stated(key, f"with a {kind} file, which says it itself", "mesh")
         if kind == ".inp" and not self.is_solid:
             raise Refusal(
                 'expected "tetrahedron" or "hexahedron" with a .inp file, whose cells are solid',
@@ -680,10 +678,8 @@ class Arm(Drive):
         check_interfaces(scene, at[-1])
         check_motor(scene, at[-1])
         check_regions(self)
-        if self.pattern is not None:
-            self._check_pattern(before)
-        elif self.design is not None and self.design not in {a.name for a in before if a.own}:
-            self._refuse_design([arm.name for arm in before if arm.own])
+        if self.design is not None:
+            self._check_design(before)
 
     def _check_material(self, scene: Scene, index: int) -> None:
         """Refuse an own material, or the scene's, that this arm cannot be made of."""
@@ -724,58 +720,35 @@ class Arm(Drive):
             reason = "expected more than 0 without [[joints]]: the machine moves in the plane"
             raise Refusal(reason, ".length")
 
-    def _refuse_design(self, names: list[str], hint: str = "") -> None:
-        allowed = " | ".join(map(shown, names)) or "no arm before it has one"
-        raise Refusal(
-            f"expected the name of an earlier arm with a design of its own: {allowed}{hint}",
-            ".design",
-        )
-
-    def _check_pattern(self, before: tuple[Arm, ...]) -> None:
-        """Refuse a pattern that is none, or whose cells are not this arm's one by one."""
-        designed = {arm.name: arm for arm in before if arm.designed}
-        if self.pattern not in designed:
-            others = {arm.name: arm.design for arm in before}
-            origin = others.get(str(self.pattern))
-            hint = f"; {self.pattern} itself has that of {origin}" if origin else ""
-            self._refuse_design(list(designed), hint)
-        assert self.pattern is not None
-        pattern = designed[self.pattern]
-        if pattern.interfaces:
+    def _check_design(self, before: tuple[Arm, ...]) -> None:
+        """Refuse a design of no arm before it, or whose cells are not this arm's one by one."""
+        owners = {arm.name: arm for arm in before if (arm.designed if self.pattern else arm.own)}
+        if (owner := owners.get(str(self.design))) is None:
+            origin = next((arm.design for arm in before if arm.name == self.design), None)
+            hint = f"; {self.design} itself has that of {origin}" if origin else ""
+            allowed = " | ".join(map(shown, owners)) or "no arm before it has one"
             raise Refusal(
-                f"expected an arm without interfaces: {self.pattern} has some, around which cells "
-                "stay solid",
+                f"expected the name of an earlier arm with a design of its own: {allowed}{hint}",
                 ".design",
             )
-        if self.hollow or pattern.hollow:
-            raise Refusal(
-                f"expected that of {self.pattern}, whose design it has: walls are not scaled",
-                f".{self.differences(pattern)[0]}",
-                ".design",
-            )
-        for item, name in ((pattern, self.pattern), (self, self.name)):
-            if item.mesh is not None:
+        if self.pattern is None:
+            return
+        for arm, key in product((owner, self), ("mesh", "hollow", "interfaces")):
+            if getattr(arm, key):
+                same = ", ".join(self.differences(owner))
                 raise Refusal(
-                    f"expected an arm with cells, or the same "
-                    f"{', '.join(self.differences(pattern))} as it has: {name} has mesh = "
-                    f"{shown(item.mesh)}, whose cells have no "
-                    "partners in another mesh",
+                    f"expected the same {same} as {owner.name} has: {arm.name} has {key}, and only "
+                    "arms of cells, without further interfaces, are scaled",
                     ".design",
-                    ".mesh",
+                    f".{key}",
                 )
-        if self.cells != pattern.cells:
-            raise Refusal(
-                f"expected {shown(pattern.cells)} as {self.pattern} has, whose design it repeats "
-                "cell by cell",
-                ".cells",
-                ".design",
-            )
-        for key in PATTERN_KEYS:
-            stated, theirs = getattr(self, key), getattr(pattern, key)
-            if stated not in (Arm.model_fields[key].default, theirs):
+        for key in ("cells", *PATTERN_KEYS):
+            theirs = getattr(owner, key)
+            if getattr(self, key) not in (theirs, Arm.model_fields[key].default):
+                words = shown(theirs) if key == "cells" else "that"
                 raise Refusal(
-                    f"expected none: it is that of {self.pattern}, scaled, whose design this arm "
-                    "repeats",
+                    f"expected none, or {words} as {owner.name} has, whose design this arm "
+                    "repeats, scaled",
                     f".{key}",
                     ".design",
                 )

@@ -38,18 +38,17 @@ Line = tuple[Component, Component]
 Kind = Literal["ball", "pin", "slider", "universal", "rod"]
 # Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
 OF_THE_END = ("deviation", "settling")
-# What is positive of every equation's force, in the joint's frame, and its unit; in the plane and
-# in space.
-Parts = tuple[tuple[str, str], ...]
-IN_PLANE: dict[str, Parts] = {"pin": (("x", "N"), ("y", "N")), "slider": (("normal", "N"),)}
-IN_SPACE: dict[str, Parts] = {
-    "ball": (("x", "N"), ("y", "N"), ("z", "N")),
-    "pin": (("x", "N"), ("y", "N"), ("z", "N"), ("moment_1", "N m"), ("moment_2", "N m")),
-    "slider": (("force_1", "N"), ("force_2", "N"), ("moment_1", "N m"), ("moment_2", "N m"),
-               ("moment_3", "N m")),
-    "universal": (("x", "N"), ("y", "N"), ("z", "N"), ("moment", "N m")),
-    "rod": (("", "N"),),
-}  # fmt: skip
+# What is positive of every equation's force and moment, in the joint's frame; in the plane and in
+# space.
+Names = tuple[str, ...]
+IN_PLANE: dict[str, tuple[Names, Names]] = {"pin": (("x", "y"), ()), "slider": (("normal",), ())}
+IN_SPACE: dict[str, tuple[Names, Names]] = {
+    "ball": (("x", "y", "z"), ()),
+    "pin": (("x", "y", "z"), ("moment_1", "moment_2")),
+    "slider": (("force_1", "force_2"), ("moment_1", "moment_2", "moment_3")),
+    "universal": (("x", "y", "z"), ("moment",)),
+    "rod": (("",), ()),
+}
 
 
 class Closures(Table):
@@ -113,9 +112,10 @@ class Closures(Table):
         """Whether the length of a rod changes: it is a rigid coordinate of the machine."""
         return self.driven or self.is_spring
 
-    def parts(self, dimension: int) -> Parts:
+    def parts(self, dimension: int) -> tuple[tuple[str, str], ...]:
         """Return what is positive of every equation's force, in the joint's frame, and its unit."""
-        return (IN_SPACE if dimension == 3 else IN_PLANE)[self.kind]
+        forces, moments = (IN_SPACE if dimension == 3 else IN_PLANE)[self.kind]
+        return *((name, "N") for name in forces), *((name, "N m") for name in moments)
 
     @field_validator("axis")
     @classmethod

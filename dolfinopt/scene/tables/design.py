@@ -363,15 +363,13 @@ class Region(Table):
 
 
 def check_regions(arm: Arm) -> None:
-    """Refuse a region outside a rectangular arm; other things the mesh must tell.
+    """Refuse regions that a rectangular arm cannot have; of others the mesh tells.
 
     Raises:
         Refusal: its keys are the arm's own.
     """
     if not arm.regions or arm.cells is None:
         return
-    for number, region in enumerate(arm.regions):
-        _check_place(region, arm, f".regions.{number}")
     from dolfinopt.scene.regions import MOST_CELLS, grid_regions  # NumPy
 
     problem = grid_regions(arm)[1] if arm.n_cells <= MOST_CELLS else None
@@ -379,26 +377,6 @@ def check_regions(arm: Arm) -> None:
         number, reason = problem
         shape = arm.regions[number].shape
         raise Refusal(reason, f".regions.{number}.{shape}", ".passive", ".cells")
-
-
-def _check_place(region: Region, arm: Arm, at: str) -> None:
-    """Refuse a region beside a box, or above or below it."""
-    x0, y0, x1, y1 = region.bounds
-    half, deep = 0.5 * arm.height, 0.5 * arm.thickness
-    if x0 >= arm.length or x1 <= 0.0 or y0 >= half or y1 <= -half:
-        raise Refusal(
-            f"expected a place in the arm, x from 0 to {arm.length} and y from {-half:g} "
-            f"to {half:g} [m]",
-            f"{at}.{region.shape}",
-            ".length",
-            ".height",
-        )
-    if region.depth is not None and (region.depth[0] >= deep or region.depth[1] <= -deep):
-        raise Refusal(
-            f"expected a place in the arm, z from {-deep:g} to {deep:g} [m]",
-            f"{at}.depth",
-            ".thickness",
-        )
 
 
 # -- `[interpolation]` ---------------------------------------------------------------------------

@@ -176,7 +176,9 @@ class Objective(Table):
 
     def check_in_scene(self, scene: Scene, at: Loc) -> None:
         """Refuse what this objective, its gradient or the scenarios cannot have."""
-        self._check_weights(scene)
+        refuse_count(self.effort_weights, scene.driven, ".effort_weights")
+        if self.effort_weights is not None and not any(self.effort_weights):
+            raise Refusal("expected a number above 0 for one drive at least", ".effort_weights")
         self._check_unused(scene)
         self._check_attached(scene)
         self._check_static(scene)
@@ -197,26 +199,17 @@ class Objective(Table):
         self._check_exact(scene)
 
     def _check_exact(self, scene: Scene) -> None:
-        """Refuse reductions and integrators without adjoint where the gradient is exact."""
-        because, key = self._why_exact(scene)
-        remedy = '; or state objective.gradient = "esl"' if key[-1] == "gradient" else ""
-        if because and scene.reduction.method == "balanced":
+        """Refuse a reduction without adjoint where the gradient of the motion is exact."""
+        exact = [f'objective.kind = "{self.kind}"'] if self.response.exact else []
+        exact += [f"constraints.{key}" for key in scene.limits if limited_by(key).exact]
+        exact += ['objective.gradient = "exact" (state "esl")'] if self.gradient == "exact" else []
+        if exact and scene.reduction.method == "balanced":
             raise Refusal(
-                f'expected "craig-bampton", "modal" or "krylov" with {because}: '
-                f"the Gramian's basis has no adjoint{remedy}",
+                f'expected "craig-bampton", "modal" or "krylov" with {exact[0]}: the Gramian\'s '
+                "basis has no adjoint",
                 "reduction.method",
-                key,
+                exact[0].partition(" ")[0],
             )
-
-    def _why_exact(self, scene: Scene) -> tuple[str, Loc]:
-        """Return what asks for the exact gradient of a motion, and its key; "" if nothing does."""
-        if self.response.exact:
-            return f'objective.kind = "{self.kind}"', ("objective", "kind")
-        for key in scene.limits:
-            if limited_by(key).exact:
-                return f"constraints.{key}", ("constraints", key)
-        exact = 'objective.gradient = "exact"' if self.gradient == "exact" else ""
-        return exact, ("objective", "gradient")
 
     def _check_unused(self, scene: Scene) -> None:
         """Refuse options that neither the objective nor a limit uses."""
@@ -235,17 +228,6 @@ class Objective(Table):
         if not scene.scenarios:
             reason = "without [[scenarios]]: there are none to combine"
             self.refuse_stated(".scenarios", reason)
-
-    def _check_weights(self, scene: Scene) -> None:
-        if self.effort_weights is None:
-            return
-        drives = scene.driven
-        if len(self.effort_weights) != len(drives) or not any(self.effort_weights):
-            number = "1 number" if len(drives) == 1 else f"{len(drives)} numbers"
-            raise Refusal(
-                f"expected {number}, for {', '.join(drives)}, not all of them 0",
-                "objective.effort_weights",
-            )
 
     def static_loads(self, scene: Scene) -> tuple[Load | SpatialLoad, ...]:
         """Return the static load cases of the scene's arms."""
