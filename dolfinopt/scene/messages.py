@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple, get_origin
 
@@ -100,27 +100,15 @@ def check_tables(tree: dict[str, Any], source: str, changes: Sequence[Override] 
     """
     if isinstance(tree.get("material"), str):
         tree["material"] = {"name": tree["material"]}
-    for loc in _misplaced(tree):
-        raise input_error(blamed(source, changes, (loc,)), wrong_value(loc, tree))
-
-
-def _misplaced(node: Mapping[str, Any], model: type[Table] = Scene, loc: Loc = ()) -> Iterator[Loc]:
-    """Yield where a scene's data has something else than its tables and arrays of them."""
-    for key, value in node.items():
-        field = model.model_fields.get(key)
-        table = table_in(field.annotation) if field else None
-        if field is None or table is None or value is None:
+    for key, value in tree.items():
+        field = Scene.model_fields.get(key)
+        if field is None or table_in(field.annotation) is None or value is None:
             continue
-        array = get_origin(without_none(field.annotation)) is tuple
-        if array and not isinstance(value, list | tuple):
-            yield (*loc, key)
-            continue
+        array = is_array(field) and isinstance(value, list | tuple)
         for i, row in enumerate(value if array else [value]):
-            at = (*loc, key, i) if array else (*loc, key)
-            if isinstance(row, dict):
-                yield from _misplaced(row, table, at)
-            else:
-                yield at
+            if not isinstance(row, dict):
+                loc = (key, i) if array else (key,)
+                raise input_error(blamed(source, changes, (loc,)), wrong_value(loc, tree))
 
 
 def _key_loc(raw: Loc) -> Loc:
@@ -163,6 +151,11 @@ def model_at(loc: Loc) -> type[Table] | None:
         field = model.model_fields.get(part) if model else None
         model = table_in(field.annotation) if field else None
     return model
+
+
+def is_array(field: FieldInfo) -> bool:
+    """Return whether a key holds an array, of tables or of values."""
+    return get_origin(without_none(field.annotation)) is tuple
 
 
 def field_at(loc: Loc) -> FieldInfo:

@@ -6,7 +6,7 @@ The tree is the scene as read, before it is validated: values of any type may st
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, get_origin
+from typing import Any
 
 from dolfinopt.scene.inheritance import BODY
 from dolfinopt.scene.messages import (
@@ -16,13 +16,14 @@ from dolfinopt.scene.messages import (
     check_tables,
     dotted,
     field_at,
+    is_array,
     model_at,
     unknown_key,
     value_at,
 )
 from dolfinopt.scene.old_words import CLOSURE, is_old, scaled
 from dolfinopt.scene.tables.arms import MESH_KEYS
-from dolfinopt.scene.tables.base import Loc, cut, input_error, rows, without_none
+from dolfinopt.scene.tables.base import Loc, cut, input_error, rows
 from dolfinopt.scene.tables.material import material_keys
 from dolfinopt.scene.toml import tomllib
 
@@ -114,7 +115,7 @@ def _is_array(loc: Loc) -> bool:
     """Tell whether `loc` is the path of an array of tables."""
     if not loc or isinstance(loc[-1], int):
         return False
-    return get_origin(without_none(field_at(loc).annotation)) is tuple
+    return is_array(field_at(loc))
 
 
 def _store(tree: Tree, loc: Loc, value: Any) -> None:

@@ -277,7 +277,7 @@ class Scene(Table):
     @property
     def rods(self) -> tuple[Closures, ...]:
         """Rods whose length is a rigid coordinate, behind those of the joints."""
-        return tuple(closure for closure in self.closures if closure.has_coordinate)
+        return tuple(item for item in self.closures if item.driven or item.is_spring)
 
     @property
     def rigid_units(self) -> dict[str, str]:

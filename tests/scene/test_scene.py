@@ -212,7 +212,6 @@ BAD_VALUES = [
     ("objective.loads", [[[0, 1]], [0, 1, 0]], "an array of arrays of three numbers"),
     ("objective.effort_weights constraints.peak_force", [[1.0, 2.0]],
      "3 numbers, for cart, arm1, arm2"),
-    ("design.filter_radius", [1.001], "at most the length of the longest arm, 1.0 [m]"),
     ("material", [5], "a table with the keys name, kind, young_modulus, poisson_ratio"),
     ("motion", [[1, 2]], "a table with the keys path, radius"),
     ("arms", [[]], "[[arms]], at least one"),

@@ -19,7 +19,6 @@ from dolfinopt.scene.tables.base import (
     FileName,
     Inertia,
     Length,
-    Loc,
     Position,
     Refusal,
     Six,
@@ -660,9 +659,10 @@ class Arm(Drive):
             in_frame(self, interface.point) for interface in self.further_interfaces
         )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse files of one name, and what does not fit the arm whose design it has."""
-        before = scene.arms[: at[-1]]
+        index = scene.places[self.name]
+        before = scene.arms[:index]
         if not scene.is_spatial:
             self._check_files(before)
             self.check_plane_bearing()
@@ -673,10 +673,10 @@ class Arm(Drive):
                 ".cells" if self.cells is not None else ".cell_shape",
             )
         if self.flexible:
-            self._check_material(scene, at[-1])
+            self._check_material(scene, index)
         self._check_inertia(scene)
-        check_interfaces(scene, at[-1])
-        check_motor(scene, at[-1])
+        check_interfaces(scene, index)
+        check_motor(scene, index)
         check_regions(self)
         if self.design is not None:
             self._check_design(before)

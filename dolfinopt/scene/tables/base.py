@@ -184,8 +184,8 @@ class Table(BaseModel):
         object.__setattr__(checked, "__pydantic_private__", copy.__pydantic_private__)
         return checked
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Check what this table at `at` and other tables of `scene` must agree on.
+    def check_in_scene(self, scene: Scene) -> None:
+        """Check what this table and others of `scene` must agree on.
 
         Raises:
             Refusal: they do not.
@@ -200,7 +200,7 @@ class Table(BaseModel):
         try:
             self._check_name(scene, at)
             self._check_dimension(scene)
-            self.check_in_scene(scene, at)
+            self.check_in_scene(scene)
         except Refusal as refusal:
             raise refusal.below(at) from None
 

@@ -11,7 +11,6 @@ from dolfinopt.scene.tables.base import (
     Angle,
     Component,
     Length,
-    Loc,
     Position,
     Refusal,
     Stiffness,
@@ -107,11 +106,6 @@ class Closures(Table):
         """Whether it is a rod that gives way."""
         return self.stiffness > 0.0
 
-    @property
-    def has_coordinate(self) -> bool:
-        """Whether the length of a rod changes: it is a rigid coordinate of the machine."""
-        return self.driven or self.is_spring
-
     def parts(self, dimension: int) -> tuple[tuple[str, str], ...]:
         """Return what is positive of every equation's force, in the joint's frame, and its unit."""
         forces, moments = (IN_SPACE if dimension == 3 else IN_PLANE)[self.kind]
@@ -137,7 +131,7 @@ class Closures(Table):
         if abs(along) > 1e-6 * math.hypot(*self.axis) * math.hypot(*self.cross_axis):
             raise Refusal("expected a direction across closures.axis", "cross_axis", "axis")
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
         if self.name.casefold() in [joint.name.casefold() for joint in scene.joints]:
             raise Refusal("expected a name that no joint or other closure has", ".name")

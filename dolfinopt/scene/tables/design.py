@@ -12,7 +12,6 @@ from dolfinopt.scene.tables.base import (
     MAX_ITERATIONS,
     Extent,
     Length,
-    Loc,
     Position,
     Refusal,
     Table,
@@ -196,20 +195,12 @@ class Design(Table):
                 "volume_fraction",
             )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what the arms, their cells and their solid ends cannot meet."""
         if not scene.cell_counts:  # nothing to design
             return
         self._check_hollow(scene)
         self._check_member_width(scene)
-        longest = max(arm.length for arm in scene.arms)
-        if self.filter_radius > longest:
-            raise Refusal(
-                f"expected at most the length of the longest arm, {longest} [m]: a wider filter "
-                "leaves one density for a whole arm",
-                "design.filter_radius",
-                *(f"arms.{i}.length" for i in range(len(scene.arms))),
-            )
         self._check_volume(scene)
 
     def _check_hollow(self, scene: Scene) -> None:

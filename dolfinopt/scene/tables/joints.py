@@ -172,7 +172,7 @@ def check_bores(arm: Arm) -> None:
     Raises:
         Refusal: its keys are paths from the arm.
     """
-    ends = {interface.name.strip().casefold(): k for k, interface in enumerate(arm.interfaces)}
+    ends = {interface.is_end: k for k, interface in enumerate(arm.interfaces)}
     bores = [ends[name] for name in (INBOARD, OUTBOARD) if name in ends]
     for k in bores:
         at = f"interfaces.{k}"

@@ -185,7 +185,12 @@ def check_orthotropic(solid: Material, dim: int | None) -> None:
     young, ratio = solid.young_modulus, solid.poisson_ratio
     if not isinstance(young, tuple):
         raise Refusal('expected [E1, E2] with kind = "orthotropic"', "young_modulus", "kind")
-    for key, most in (("young_modulus", 2), ("poisson_ratio", 1), ("shear_modulus", 1)):
+    for key, most in (
+        ("young_modulus", 2),
+        ("poisson_ratio", 1),
+        ("shear_modulus", 1),
+        ("angle", 1),
+    ):
         value = getattr(solid, key)
         if dim == 2 and isinstance(value, tuple) and len(value) > most:
             raise Refusal(f"expected {most} of an arm in plane stress, not 3", key)
@@ -208,5 +213,3 @@ def check_orthotropic(solid: Material, dim: int | None) -> None:
             "poisson_ratio",
             "young_modulus",
         )
-    if dim == 2 and isinstance(solid.angle, tuple):
-        raise Refusal("expected a number of an arm in plane stress", "angle")

@@ -16,7 +16,6 @@ from dolfinopt.scene.tables.base import (
     Inertia,
     Instant,
     Length,
-    Loc,
     Position,
     Refusal,
     Table,
@@ -269,7 +268,7 @@ class Motion(Table):
                 *(("motion", key) for key in limits),
             )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
         if self.table_ends == "moving" and self.horizon > self.duration:
             raise Refusal(
@@ -376,19 +375,15 @@ class Simulation(Table):
         le=1e5,
     )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse an interval longer than the horizon, or too short for the memory."""
         horizon = scene.motion.horizon
-        if not 1.0 <= self.num_samples(horizon) <= MAX_SAMPLES:
+        if not 1.0 <= horizon / self.sample * (1.0 + 1e-9) <= MAX_SAMPLES:
             raise Refusal(
                 f"expected between {horizon / MAX_SAMPLES} and motion.horizon = {horizon} [s]",
                 "simulation.sample",
                 "motion.horizon",
             )
-
-    def num_samples(self, horizon: float) -> float:
-        """Return how many intervals of the output a `horizon`, s, has; 3 s of 1 ms are 3000."""
-        return horizon / self.sample * (1.0 + 1e-9)
 
 
 # -- `[reduction]` -------------------------------------------------------------------------------
@@ -477,7 +472,7 @@ class Reduction(Table):
             return self.fewest
         return self.fewest // 3 * arm.num_outboard
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse more coordinates than an arm has dofs, and undamped resonances in a Gramian."""
         for i, arm in enumerate(scene.arms):
             least = self.fewest_of(arm)

@@ -13,7 +13,6 @@ from dolfinopt.scene.tables.base import (
     ByDimension,
     Extent,
     Instant,
-    Loc,
     Refusal,
     Six,
     Table,
@@ -174,7 +173,7 @@ class Objective(Table):
         """Whether the objective has a gradient with frozen equivalent static loads."""
         return self.needs("motion") and not self.response.exact
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what this objective, its gradient or the scenarios cannot have."""
         refuse_count(self.effort_weights, scene.driven, ".effort_weights")
         if self.effort_weights is not None and not any(self.effort_weights):
@@ -310,7 +309,7 @@ class ConstraintOptions(Table):
             return self.poles_at
         return (0.0, 0.5 * motion.duration, motion.duration)
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse arrays that are not one limit for everything that has a value."""
         owners = {
             "peak_force": scene.driven,
@@ -320,7 +319,7 @@ class ConstraintOptions(Table):
         for key, names in owners.items():
             refuse_count(getattr(self, key), names, f".{key}")
         for index, var in enumerate(vars(self)["stiffness"] or ()):
-            var.check_at(scene, (*at, "stiffness", index))
+            var.check_at(scene, ("constraints", "stiffness", index))
         self._check_delay(scene.motion)
         self._check_poles(scene)
         self._check_arms(scene)
@@ -462,7 +461,7 @@ class Scenario(Table):
                 )
         return changes
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse changes of a material that are more than a factor of its stiffness."""
         for change in self.changes:
             table, _, key = change.partition("=")[0].strip().partition(".")

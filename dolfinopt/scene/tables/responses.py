@@ -17,7 +17,6 @@ from pydantic import Field
 
 from dolfinopt.scene.tables.base import (
     DriveForce,
-    Loc,
     Refusal,
     Table,
     Three,
@@ -72,18 +71,18 @@ class StiffnessCase(Table):
             turning = none
         return (*(force or none), *turning)
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what is no arm with a design, no load on it, or without limit."""
         names = [arm.name for arm in scene.arms if arm.flexible]
         if self.arm not in names:
             raise Refusal(f"expected the name of an arm with a design: {', '.join(names)}", ".arm")
         if self.displacement is None and self.rotation is None:
-            raise Refusal("expected displacement or rotation, or both", at)
+            raise Refusal("expected displacement or rotation, or both", "")
         if not any(self.load):
-            raise Refusal("expected force or moment, not all of them zero", at)
+            raise Refusal("expected force or moment, not all of them zero", "")
         if len(self.load) != (6 if scene.is_spatial else 3):
             kind = "three components each" if scene.is_spatial else "two components and one number"
-            raise Refusal(f"expected force and moment of {kind} in this scene", at)
+            raise Refusal(f"expected force and moment of {kind} in this scene", "")
 
 
 Cases = tuple[StiffnessCase, ...]
