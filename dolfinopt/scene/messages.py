@@ -102,8 +102,8 @@ def check_tables(tree: dict[str, Any], source: str, changes: Sequence[Override] 
         tree["material"] = {"name": tree["material"]}
     for key, value in tree.items():
         field = Scene.model_fields.get(key)
-        if field is None or table_in(field.annotation) is None or value is None:
-            continue
+        if field is None or table_in(field.annotation) is None or value is field.default:
+            continue  # None is no table, but for [control]
         array = is_array(field) and isinstance(value, list | tuple)
         for i, row in enumerate(value if array else [value]):
             if not isinstance(row, dict):
@@ -134,10 +134,9 @@ def _closest(above: Loc, key: str, known: list[str]) -> list[str]:
     paths = [info.key for info in describe_keys()]
     if elsewhere := [path for path in paths if path.endswith(f".{key}")]:
         return elsewhere  # the right key in the wrong table
-    if starts := [name for name in known if name.startswith(key) and key]:
-        return [".".join(map(key_text, (*above, name))) for name in starts]
-    if near := difflib.get_close_matches(key, known, 1):
-        return [".".join(map(key_text, (*above, near[0])))]
+    starts = [name for name in known if name.startswith(key) and key]
+    if near := starts or difflib.get_close_matches(key, known, 1):
+        return [".".join(map(key_text, (*above, name))) for name in near]
     names = {path.rpartition(".")[2]: path for path in paths}
     return [names[name] for name in difflib.get_close_matches(key, names, 1, 0.8)]
 

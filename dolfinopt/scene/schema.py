@@ -21,7 +21,7 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
-from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, setting, table_in
+from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, setting, table_in
 from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
@@ -392,11 +392,6 @@ FILE_KEYS = tuple(
 )
 
 
-def file_in(key: str, value: str) -> bool:
-    """Return whether the value of one of `FILE_KEYS` is a file, not a word as "tube" is."""
-    return key != "hollow" or Path(value).suffix != ""
-
-
 # -- the keys of a scene as JSON schema, from which editors complete and check scene files -------
 
 SCHEMA_FILE = "dolfinopt.schema.json"
@@ -478,13 +473,12 @@ def program() -> list[str | int]:
 def named_files(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
     """Yield dotted key, table and key of every file that a scene's data names."""
     for table, key in FILE_KEYS:
-        node = data.get(table)
-        rows = node if isinstance(node, list) else [node]
-        for k, row in enumerate(rows):
-            value = row.get(key) if isinstance(row, dict) else None
-            if isinstance(value, str) and file_in(key, value):
-                name = f"{table}.{k}.{key}" if isinstance(node, list) else f"{table}.{key}"
-                yield name, row, key
+        for k, row in enumerate(rows(data, table)):
+            value = row.get(key)
+            # A word of arms.hollow, such as "tube", is none.
+            if isinstance(value, str) and (key != "hollow" or Path(value).suffix):
+                place = f"{table}.{k}" if isinstance(data[table], list) else table
+                yield f"{place}.{key}", row, key
 
 
 def with_digests(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -207,7 +207,7 @@ BAD_VALUES = [
     ("simulation.sample", [1e-9], "between 3e-07 and"),
     ("objective.load_cases", [3001], "at most 3000"),
     ("objective.loads", [[]], "at least one load [F_x, F_y, moment]"),
-    ("objective.loads", [[[0, 0, 0]]], "none of them all zero"),
+    ("objective.loads", [[[0, 0, 0]]], "between 1e-09 and"),
     ("objective.loads", [[[0, 1e-300, 0]], [[0, 1e10, 0]]], "between 1e-09 and 1e+09 [N, N m]"),
     ("objective.loads", [[[0, 1]], [0, 1, 0]], "an array of arrays of three numbers"),
     ("objective.effort_weights constraints.peak_force", [[1.0, 2.0]],

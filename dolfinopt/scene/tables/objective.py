@@ -149,13 +149,11 @@ class Objective(Table):
     @field_validator("loads")
     @classmethod
     def _check_loads(cls, loads: tuple[Load | SpatialLoad, ...]) -> tuple[Load | SpatialLoad, ...]:
-        if not loads or not all(any(load) for load in loads):
-            raise Refusal("expected at least one load [F_x, F_y, moment], none of them all zero")
         sizes = [max(map(abs, load)) for load in loads]
-        if min(sizes) < 1.0 / LARGEST_LOAD or max(sizes) > LARGEST_LOAD:
+        if not loads or min(sizes) < 1.0 / LARGEST_LOAD or max(sizes) > LARGEST_LOAD:
             raise Refusal(
-                f"expected loads whose largest component is between {1.0 / LARGEST_LOAD:g} and "
-                f"{LARGEST_LOAD:g} [N, N m]"
+                "expected at least one load [F_x, F_y, moment], the largest component of each "
+                f"between {1.0 / LARGEST_LOAD:g} and {LARGEST_LOAD:g} [N, N m]"
             )
         return loads
 
