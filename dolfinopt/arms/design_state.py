@@ -171,12 +171,12 @@ class DesignState:
         """What the reduction method is told.
 
         Raises:
-            InputError: the number of coordinates is "auto", and nobody has chosen one.
+            InputError: the number of coordinates follows from an error, and nobody has chosen it.
         """
         if self.num_modes is None:
             raise InputError(
-                f'{self.scene.source}: reduction.coordinates = "auto": expected a number here, or '
-                "choose_coordinates() before the first evaluation"
+                f"{self.scene.source}: reduction.coordinates = {self.scene.reduction.coordinates}: "
+                "expected an integer here, or choose_coordinates() before the first evaluation"
             )
         return options(self.scene, self.num_modes)
 

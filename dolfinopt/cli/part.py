@@ -286,7 +286,7 @@ class PartsJob:
         if rough:
             click.echo(
                 f"no STEP of {', '.join(rough)}: a free-form surface, in triangles (STL, 3MF); "
-                "arms.extruded = true makes plates, which have curves"
+                'arms.symmetric = "extruded" makes plates, which have curves'
             )
         machine = ", the machine with these parts in part.toml" if self.meshes is not None else ""
         click.echo(f"{elapsed():.1f} s; files in {target}{machine}")

@@ -112,7 +112,7 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
 
 
 def scene_of(folder: Path, overrides: tuple[str, ...] = ()) -> Scene:
-    """Return the scene of a run, with what "auto" came to: coordinates and stiffening."""
+    """Return the scene of a run, with the coordinates and stiffening that it came to."""
     from dolfinopt.scene.load import scene_from_dict
     from dolfinopt.scene.schema import found_again
 
@@ -120,9 +120,8 @@ def scene_of(folder: Path, overrides: tuple[str, ...] = ()) -> Scene:
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
         data = found_again(summary["scene"], folder, summary.get("files", {}))
-        if data["reduction"]["coordinates"] == "auto":
-            data["reduction"]["coordinates"] = summary["reduction"]["coordinates"]
-            del data["reduction"]["tolerance"]
+        reduction = summary.get("reduction", data["reduction"])
+        data["reduction"]["coordinates"] = reduction["coordinates"]
         decided = summary.get("stiffening")
         if decided is not None and data["simulation"]["stiffening"] == "auto":
             data["simulation"]["stiffening"] = decided["on"]
@@ -203,10 +202,7 @@ def tell_assumed(world: MPI.Comm, scene: Scene) -> None:
 
 
 def chosen(coordinates: int, error: float) -> str:
-    return (
-        f'reduction.coordinates = "auto": {coordinates} coordinates an arm, estimated error '
-        f"{error:.2g}"
-    )
+    return f"reduction: {coordinates} coordinates an arm, estimated error {error:.2g}"
 
 
 BEGUN = time.perf_counter()

@@ -162,21 +162,16 @@ def turned(C: np.ndarray, directions: np.ndarray) -> np.ndarray:
 def directions(mesh: ArmMesh, solid: Material) -> np.ndarray:
     """Return the directions 1, 2 (, 3) of a material (..., d, d) in the arm's frame, in rows.
 
-    Those of axes turned about `angle_axis`; of a hollow arm direction 3 is the wall's normal from
+    Those of axes turned by `angle`; of a hollow arm direction 3 is the wall's normal from
     within, and 1 the arm's axis along the wall, turned about it.
     """
     angle = solid.angle or 0.0
-    if mesh.dim == 2:
-        return rotation(np.array([0.0, 0.0, 1.0]), angle)[:2, :2]
+    turned = angle if isinstance(angle, tuple) else (0.0, 0.0, angle)
+    axes = Rotation.from_euler("xyz", turned).as_matrix().T
     if mesh.wall is None:
-        return rotation(np.array(solid.angle_axis or (0.0, 0.0, 1.0)), angle)
+        return axes[: mesh.dim, : mesh.dim]
     normal = mesh.wall.normals
     along = np.eye(3)[0] - normal[:, :1] * normal
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     frame = np.stack([along, np.cross(normal, along), normal], axis=1)
-    return rotation(np.array([0.0, 0.0, 1.0]), angle) @ frame
-
-
-def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Return the axes x, y, z turned about an axis, in rows (3, 3)."""
-    return Rotation.from_rotvec(angle * axis / np.linalg.norm(axis)).as_matrix().T
+    return axes @ frame

@@ -307,13 +307,6 @@ def stations(length: float, along: int) -> np.ndarray:
     return np.concatenate([x[:1], ends, x[1:-1], (length - ends)[::-1], x[-1:]])
 
 
-def rib_stations(hull: Hull, count: int) -> list[int]:
-    """Return the stations nearest to so many places at even distances between the ends."""
-    x = hull.outer[:, 0, 0]
-    places = np.linspace(x[0], x[-1], count + 2)[1:-1]
-    return [int(np.argmin(np.abs(x - place))) for place in places]
-
-
 def box_hull(
     size: tuple[float, float, float], cells: tuple[int, int, int], largest_wall: float
 ) -> Hull:

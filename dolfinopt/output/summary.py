@@ -654,9 +654,9 @@ def _too_few(scene: Scene, choice: OrderSelection | None) -> list[str]:
         return []
     return [
         f"with the {choice.coordinates} coordinates that were chosen for the initial design the "
-        f"final one has an estimated error of {choice.error:.2g}, above reduction.tolerance = "
+        f"final one has an estimated error of {choice.error:.2g}, above "
         f"{scene.reduction.tolerance:g}; optimise with reduction.coordinates = "
-        f"{2 * choice.coordinates}, or a smaller tolerance"
+        f"{2 * choice.coordinates}, or a smaller error"
     ]
 
 

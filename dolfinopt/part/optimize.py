@@ -227,7 +227,7 @@ def _free(scene: Scene, k: int, part: Part, more: float = 1.0) -> FreeSides:
         raise InputError(
             f"--optimize: the surface of arm {part.name!r} has no sides that could move: its part "
             "is what dolfinopt optimize has made of it; leave --optimize out, or make a plate of "
-            "it (arms.extruded = true)"
+            'it (arms.symmetric = "extruded")'
         )
     smallest, tool = min([1.0, *sizes]), flat.outline.tool_radius
     limits = limits_of_part(flat.domain, tool, scene.design.minimum_gap, smallest)

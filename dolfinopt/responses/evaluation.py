@@ -328,7 +328,7 @@ def _stiffening(
 ) -> Stiffening:
     """Return what is decided for scenes of the same arms together (collective)."""
     stated = scenes[0].simulation.stiffening
-    if stated != "auto" and not scenes[0].estimates_stiffening:
+    if stated != "auto" and scenes[0].is_spatial:  # most of a solid arm's memory would go
         return Stiffening(None, stated is True)
     with together(partition.world):
         mine = {k: arm.current.static_body for k, arm in arms.items()}

@@ -36,7 +36,7 @@ RICHER_METHOD = "craig-bampton"  # of what motions and poles are compared with
 
 @dataclass(frozen=True)
 class OrderSelection:
-    """What "auto" has chosen.
+    """What was chosen by the error of the reduction.
 
     Attributes:
         coordinates: of every arm.
@@ -59,7 +59,7 @@ def choose_coordinates(
     *,
     reserve: float = 1.0,
 ) -> OrderSelection | None:
-    """Let the arms reduce to the fewest coordinates that meet `reduction.tolerance` (collective).
+    """Let the arms reduce to the fewest coordinates that meet the scene's error (collective).
 
     Numbers are tried upwards in growing steps, then bisected: the one below the chosen one does
     not meet the tolerance. Where the scene states a number nothing is done.
@@ -76,7 +76,7 @@ def choose_coordinates(
         ConvergenceError: no number up to `COORDINATES_LIMIT` meets the tolerance; on all
             ranks alike.
     """
-    if scene.reduction.coordinates != "auto" or not scene.cell_counts:
+    if scene.reduction.count or not scene.cell_counts:
         return None
     comparison = Comparison(scene, partition, arms, x_phys, profile)
     least = max(scene.reduction.fewest_of(arm) for arm in scene.arms)
@@ -99,13 +99,13 @@ def choose_coordinates(
 def _none_found(scene: Scene, tried: Mapping[int, float], goal: float) -> ConvergenceError:
     method = scene.reduction.method
     other = "" if method == RICHER_METHOD else f', reduction.method = "{RICHER_METHOD}"'
-    tolerance = f"reduction.tolerance = {scene.reduction.tolerance:g}"
+    above = f"above {goal:.2g}"
     if goal < scene.reduction.tolerance:
-        tolerance = f"the {goal:.2g} that {tolerance} asks of the initial design"
+        above += f", asked of an initial design for {scene.reduction.tolerance:g}"
     return ConvergenceError(
-        f'{scene.source}: reduction.coordinates = "auto": with up to {max(tried)} coordinates the '
-        f"estimated error is {min(tried.values()):.2g} at best, above {tolerance}; give a larger "
-        f"one{other}, or a number"
+        f"{scene.source}: reduction.coordinates: with up to {max(tried)} coordinates the "
+        f"estimated error is {min(tried.values()):.2g} at best, {above}; give a larger "
+        f"error{other}, or an integer"
     )
 
 

@@ -21,7 +21,6 @@ from dolfinopt.multibody.shape_integrals import integrals_of
 from dolfinopt.responses.measured import DAMPING_EXPONENT
 from dolfinopt.responses.motion import LoadCases, MotionResponse
 from dolfinopt.responses.response import p_norm, response
-from dolfinopt.scene.load import Scene
 
 
 class PoleResponse(MotionResponse):
@@ -37,7 +36,7 @@ class PoleResponse(MotionResponse):
     of_none: ClassVar[float] = np.inf
 
     @abstractmethod
-    def of_poles(self, poles: np.ndarray, scene: Scene) -> np.ndarray:
+    def of_poles(self, poles: np.ndarray) -> np.ndarray:
         """Return the value of every pole (P,)."""
 
     @abstractmethod
@@ -60,7 +59,7 @@ class PoleResponse(MotionResponse):
 
     def quantity(self, trajectory: Trajectory) -> np.ndarray:
         """Return the values of the poles at all instants (n, P); `of_none` of fewer."""
-        rows = [self.of_poles(pole.values, trajectory.scene) for pole in _poles(trajectory)]
+        rows = [self.of_poles(pole.values) for pole in _poles(trajectory)]
         result = np.full((len(rows), max(map(len, rows))), self.of_none)
         for row, values in zip(result, rows, strict=True):
             row[: len(values)] = values
@@ -117,11 +116,9 @@ class DampingRatio(PoleResponse):
     of_none = 1.0
     exponent = DAMPING_EXPONENT
 
-    def of_poles(self, poles: np.ndarray, scene: Scene) -> np.ndarray:
-        """Return the damping ratios of those below `constraints.damping_below`, 1 of others."""
-        limit = scene.constraints.damping_below or np.inf
-        below = np.abs(poles) <= 2.0 * np.pi * limit
-        return np.where(below, damping_ratios(poles), self.of_none)
+    def of_poles(self, poles: np.ndarray) -> np.ndarray:
+        """Return the damping ratios of all."""
+        return damping_ratios(poles)
 
     def by_poles(self, poles: np.ndarray) -> np.ndarray:
         """Return -(Im^2 + i Re Im) / |lambda|^3."""
@@ -143,7 +140,7 @@ class PoleFrequency(PoleResponse):
     Smooth: the p-norm of the periods, s.
     """
 
-    def of_poles(self, poles: np.ndarray, scene: Scene) -> np.ndarray:
+    def of_poles(self, poles: np.ndarray) -> np.ndarray:
         """Return the frequencies, Hz."""
         return np.abs(poles) / (2.0 * np.pi)
 

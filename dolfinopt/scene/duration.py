@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from dolfinopt.errors import InputError
 from dolfinopt.scene.csv_table import TIME, column_names, last_instant, read_table
 from dolfinopt.scene.laws import Law as TimeLaw
 from dolfinopt.scene.laws import Limits, ShapedLaw, law_for
@@ -22,12 +21,10 @@ def time_law(motion: Motion) -> TimeLaw | ShapedLaw:
     """Return the law by which the scene runs along its path.
 
     Raises:
-        InputError: the table cannot be used, or the limits need more time than there is.
+        InputError: the table cannot be used.
     """
     length = path_length(motion) if limits_of(motion).any else 1.0
     law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
-    if motion.duration < law.least * (1.0 - SAME_TIME):
-        raise InputError(f"motion.duration = {motion.duration:g}: {too_short(law)}")
     return ShapedLaw(law, motion.coefficients) if any(motion.coefficients) else law
 
 

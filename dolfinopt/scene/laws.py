@@ -25,6 +25,8 @@ from numpy.polynomial.polynomial import polyder, polyint, polyval
 Values = tuple[np.ndarray, np.ndarray, np.ndarray]  # a quantity and two time derivatives, (n, ...)
 SAME = 1e-12  # share of the duration by which instants differ through rounding
 POWERS = {"quintic": 2, "septic": 3}  # of u (1 - u), which the speed is proportional to
+# Their largest derivatives by u, the first, second and third.
+LARGEST = {"quintic": (15 / 8, 10 / sqrt(3), 60.0), "septic": (35 / 16, 84 / sqrt(125), 52.5)}
 
 
 @dataclass(frozen=True)
@@ -144,6 +146,7 @@ def law_for(name: str, length: float, limits: Limits, share: float) -> Law:
         share: of the duration in which a profile accelerates, and as long in which it brakes,
             where its last limit (acceleration, or jerk of an s-curve) does not tell.
     """
+    rate = 0.0
     if name in POWERS:
         speed = Polynomial([0.0, 1.0, -1.0]) ** POWERS[name]
         phases = [(0.5, speed.deriv().coef)]
@@ -159,12 +162,9 @@ def law_for(name: str, length: float, limits: Limits, share: float) -> Law:
         state = np.array([polyval(h, polyder(pieces[-1], order)) for order in range(3)])
     c = np.array([np.zeros_like(pieces[0]), *pieces]) * 0.5 / state[1]
     ends = np.cumsum([h for h, _ in phases])
-    v, a, j = (
-        max(_largest(Polynomial(p).deriv(k), h) for p, (h, _) in zip(c[1:], phases, strict=True))
-        for k in (2, 3, 4)
-    )
-    if name == "trapezoidal":
-        j = inf
+    # Accelerations of profiles are 1 at most before they are scaled; the speed is in the middle.
+    unit = 0.5 / state[1]
+    v, a, j = LARGEST.get(name, (unit * state[2], unit, unit * rate if rate else inf))
     least = max(
         length * v / limits.speed,
         sqrt(length * a / limits.acceleration),
@@ -172,12 +172,6 @@ def law_for(name: str, length: float, limits: Limits, share: float) -> Law:
     )
     orders = [np.pad(polyder(c, k, axis=1), ((0, 0), (0, k))) for k in range(4)]
     return Law(np.array([0.0, 0.0, *ends[:-1]]), np.array(orders), float(least))
-
-
-def _largest(values: Polynomial, end: float) -> float:
-    """Return the largest absolute value between 0 and `end`."""
-    extremes = np.clip(values.deriv().roots().real, 0.0, end)
-    return float(np.abs(values(np.array([0.0, end, *extremes]))).max())
 
 
 def _phases(name: str, length: float, limits: Limits, share: float) -> np.ndarray:

@@ -4,34 +4,33 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from types import UnionType
-from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin
+from typing import Annotated, Any, NamedTuple, get_origin
 
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
 
 from dolfinopt.progress import with_unit
-from dolfinopt.scene.schema import Scene
+from dolfinopt.scene.schema import Scene, TomlSchema
 from dolfinopt.scene.tables.arms import Arm, check_arm_name
 from dolfinopt.scene.tables.base import (
     Loc,
     Refusal,
     Table,
     cut,
+    input_error,
     key_text,
     one_line,
     shown,
     table_in,
     without_none,
 )
-from dolfinopt.scene.tables.closures import as_written
 from dolfinopt.scene.tables.joints import DRIVE_KEYS
-from dolfinopt.scene.tables.material import Material, check_material, material_keys
+from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.responses import need_of
 
-_COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
+COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
 
 
 @dataclass(frozen=True)
@@ -42,26 +41,20 @@ class Override:
     locs: tuple[Loc, ...]
 
 
-class _Problem(NamedTuple):
-    """One rejected key: what to print, and the paths of all keys involved, reported one first."""
-
-    text: str
-    locs: tuple[Loc, ...]
-    unknown: bool = False
+UNKNOWN = ("extra_forbidden", "invalid_key")  # pydantic's types of errors
 
 
 def first_problem(
     error: ValidationError, tree: dict[str, Any], source: str, changes: list[Override]
 ) -> str:
     """Return the one-line message of the first problem."""
-    problems = [_problem(dict(item), tree) for item in error.errors(include_url=False)]
     # A misspelt key is also a missing one: the spelling is the message that helps.
-    first = min(problems, key=lambda problem: not problem.unknown)
-    where = blamed(source, changes, (*first.locs, *(as_written(loc, tree) for loc in first.locs)))
-    return one_line(f"{where}: {first.text}")
+    errors = error.errors(include_url=False)
+    text, *locs = _problem(dict(min(errors, key=lambda item: item["type"] not in UNKNOWN)), tree)
+    return one_line(f"{blamed(source, changes, locs)}: {text}")
 
 
-def blamed(source: str, changes: Sequence[Override], locs: tuple[Loc, ...]) -> str:
+def blamed(source: str, changes: Sequence[Override], locs: Sequence[Loc]) -> str:
     """Return the place to blame for the values at `locs`: the file, or the last --set of them."""
     where = source
     for change in changes:
@@ -70,28 +63,27 @@ def blamed(source: str, changes: Sequence[Override], locs: tuple[Loc, ...]) -> s
     return where
 
 
-def _problem(item: dict[str, Any], tree: dict[str, Any]) -> _Problem:
-    """Translate one of pydantic's errors."""
+def _problem(item: dict[str, Any], tree: dict[str, Any]) -> tuple[Any, ...]:
+    """Return what one of pydantic's errors means, and the paths of all keys involved."""
     raw: Loc = item["loc"]
     loc = _key_loc(raw)
-    if item["type"] in ("extra_forbidden", "invalid_key"):
+    if item["type"] in UNKNOWN:
         model = model_at(loc[:-1])
-        fields = model.model_fields if model else {}
-        return _Problem(unknown_key(loc[:-1], loc[-1], fields, tree), (loc,), True)
+        return unknown_key(loc[:-1], loc[-1], model.model_fields if model else (), tree), loc
     if item["type"] == "missing" and len(raw) == len(loc):
         field = field_at(loc)
         text = f"missing key {dotted(loc, tree)} ({_meaning(field)})"
         if field.examples:
             text = f"missing table [{loc[-1]}] ({_meaning(field)}); write {field.examples[0]}"
-        return _Problem(text, (loc,))
+        return text, loc
     reason = item.get("ctx", {}).get("error")
     if isinstance(reason, Refusal):
-        locs = tuple((*loc, *key) for key in reason.keys) or (loc,)
-        return _Problem(f"{_found(locs[0], tree)}: {reason.reason}", locs)
+        locs = [(*loc, *key) for key in reason.keys] or [loc]
+        return f"{_found(locs[0], tree)}: {reason.reason}", *locs
     text = wrong_value(loc, tree)
     if item["type"] == "finite_number":
         text = text.replace(" number", " finite number")
-    return _Problem(text, (loc,))
+    return text, loc
 
 
 def wrong_value(loc: Loc, tree: dict[str, Any]) -> str:
@@ -100,23 +92,23 @@ def wrong_value(loc: Loc, tree: dict[str, Any]) -> str:
     return f"{_found(loc, tree)}: expected {allowed_words(field)} ({_meaning(field)})"
 
 
-def misplaced(node: Mapping[str, Any], model: type[Table] = Scene, loc: Loc = ()) -> Iterator[Loc]:
-    """Yield where a scene's data has something else than its tables and arrays of them."""
-    for key, value in node.items():
-        field = model.model_fields.get(key)
-        table = table_in(field.annotation) if field else None
-        if field is None or table is None or value is None:
-            continue
-        array = get_origin(without_none(field.annotation)) is tuple
-        if array and not isinstance(value, list | tuple):
-            yield (*loc, key)
-            continue
+def check_tables(tree: dict[str, Any], source: str, changes: Sequence[Override] = ()) -> None:
+    """Refuse what is no table where a scene has one; a name is one in place of [material].
+
+    Raises:
+        InputError: there is such a value.
+    """
+    if isinstance(tree.get("material"), str):
+        tree["material"] = {"name": tree["material"]}
+    for key, value in tree.items():
+        field = Scene.model_fields.get(key)
+        if field is None or table_in(field.annotation) is None or value is field.default:
+            continue  # None is no table, but for [control]
+        array = is_array(field) and isinstance(value, list | tuple)
         for i, row in enumerate(value if array else [value]):
-            at = (*loc, key, i) if array else (*loc, key)
-            if isinstance(row, dict):
-                yield from misplaced(row, table, at)
-            else:
-                yield at
+            if not isinstance(row, dict):
+                loc = (key, i) if array else (key,)
+                raise input_error(blamed(source, changes, (loc,)), wrong_value(loc, tree))
 
 
 def _key_loc(raw: Loc) -> Loc:
@@ -142,10 +134,9 @@ def _closest(above: Loc, key: str, known: list[str]) -> list[str]:
     paths = [info.key for info in describe_keys()]
     if elsewhere := [path for path in paths if path.endswith(f".{key}")]:
         return elsewhere  # the right key in the wrong table
-    if starts := [name for name in known if name.startswith(key) and key]:
-        return [".".join(map(key_text, (*above, name))) for name in starts]
-    if near := difflib.get_close_matches(key, known, 1):
-        return [".".join(map(key_text, (*above, near[0])))]
+    starts = [name for name in known if name.startswith(key) and key]
+    if near := starts or difflib.get_close_matches(key, known, 1):
+        return [".".join(map(key_text, (*above, name))) for name in near]
     names = {path.rpartition(".")[2]: path for path in paths}
     return [names[name] for name in difflib.get_close_matches(key, names, 1, 0.8)]
 
@@ -159,6 +150,11 @@ def model_at(loc: Loc) -> type[Table] | None:
         field = model.model_fields.get(part) if model else None
         model = table_in(field.annotation) if field else None
     return model
+
+
+def is_array(field: FieldInfo) -> bool:
+    """Return whether a key holds an array, of tables or of values."""
+    return get_origin(without_none(field.annotation)) is tuple
 
 
 def field_at(loc: Loc) -> FieldInfo:
@@ -183,52 +179,49 @@ def unit_of(field: FieldInfo) -> str:
 
 def allowed_words(field: FieldInfo) -> str:
     """Return in words what `field` accepts."""
-    return _allowed_type(field.annotation, field.metadata)
+    kind: Any = field.annotation
+    schema = TypeAdapter(Annotated[(kind, *field.metadata)] if field.metadata else kind)
+    node = schema.json_schema(schema_generator=TomlSchema)
+    words = _words(node, node.get("$defs", {}))
+    if kind is Material:
+        return f"the name of a material, or {words}"
+    return f"{words} [[arms]], at least one" if table_in(kind) is Arm else words
 
 
-def _allowed_type(annotation: Any, metadata: Iterable[Any] = (), plural: str = "") -> str:
-    annotation = without_none(annotation)
-    origin, args = get_origin(annotation), get_args(annotation)
-    if annotation is str and any(
-        getattr(rule, "func", None) is check_material for rule in metadata
-    ):
-        return "the name of a material of the catalogue"
-    if origin is Annotated:
-        rules = [rule for item in args[1:] for rule in getattr(item, "metadata", None) or [item]]
-        return _allowed_type(args[0], rules, plural)
-    if origin in (Union, UnionType):
-        kinds = [kind for kind in args if kind is not type(None)]
-        return " | ".join(_allowed_type(kind, metadata) for kind in kinds)
-    if origin is Literal:
-        return " | ".join(shown(value) for value in args)
-    if origin is tuple and table_in(annotation):
-        if table_in(annotation) is Arm:
-            return "an array of tables [[arms]], at least one"
-        return "an array of tables"
-    if origin is tuple:
-        rows = [kind for kind in (args[0], *get_args(args[0])) if get_origin(kind) is tuple]
-        inner = _allowed_type(args[0], plural="s")
-        if rows:  # of a union the shortest
-            inner = f"arrays of {_COUNTS[len(get_args(rows[0]))]} numbers"
-        count = "" if args[-1] is Ellipsis else f"{_COUNTS[len(args)]} "
-        return f"an array of {count}{inner}"
-    if annotation is Material:
-        return (
-            f"the name of a material, or a table with the keys {', '.join(Material.model_fields)}"
-        )
-    if isinstance(annotation, type) and issubclass(annotation, Table):
-        return f"a table with the keys {', '.join(annotation.model_fields)}"
-    nouns = {float: "a number", int: "an integer", str: "a string", bool: "true or false"}
-    noun = nouns[annotation]
-    noun = noun.split()[1] + plural if plural else noun
-    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-    bounds = [
-        f"{sign} {getattr(rule, name):.12g}"
-        for rule in metadata
-        for name, sign in signs.items()
-        if hasattr(rule, name)
-    ]
-    return " ".join([noun, " and ".join(bounds)]).strip()
+def _words(node: dict[str, Any], tables: dict[str, Any]) -> str:
+    """Return in words what a part of a JSON schema accepts."""
+    node = tables.get(node.get("$ref", "").rpartition("/")[2], node)
+    if "properties" in node:
+        return f"a table with the keys {', '.join(node['properties'])}"
+    if "description" in node:
+        return str(node["description"])
+    if "anyOf" in node:
+        return " | ".join(_words(item, tables) for item in node["anyOf"])
+    if "enum" in node or "const" in node:
+        return " | ".join(map(shown, node.get("enum", [node.get("const")])))
+    if node["type"] == "array":
+        return f"an array of {_elements(node['items'])}"
+    noun = {"number": "a number", "integer": "an integer", "string": "a string"}
+    return f"{noun.get(node['type'], 'true or false')}{_bounds(node)}"
+
+
+def _elements(items: Any) -> str:
+    """Return in words what stands in an array: elements in their order, or alike."""
+    count = f"{COUNTS[len(items)]} " if isinstance(items, list) else ""
+    first = items[0] if isinstance(items, list) else items
+    if "$ref" in first:
+        return "tables"
+    for kind in first.get("anyOf", [first]):  # of a union the shortest
+        if kind["type"] == "array":
+            return f"{count}arrays of {COUNTS[len(kind['items'])]} numbers"
+    return f"{count}{first['type']}s{_bounds(first)}"
+
+
+def _bounds(node: dict[str, Any]) -> str:
+    """Return the range of a number, e.g. " >= 0 and < 1"."""
+    signs = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
+    bounds = [f" {sign} {node[key]:.12g}" for key, sign in signs.items() if key in node]
+    return " and".join(bounds)
 
 
 def _found(loc: Loc, tree: dict[str, Any]) -> str:
@@ -249,7 +242,6 @@ def value_at(loc: Loc, tree: Any) -> tuple[Any, bool]:
 
 def dotted(loc: Loc, tree: dict[str, Any]) -> str:
     """Return the TOML spelling of a path, with the name of the arm it belongs to."""
-    loc = as_written(loc, tree)
     text = ".".join(map(key_text, loc))
     named = loc[0] in ("arms", "joints", "closures", "forces") and len(loc) > 1
     name = arm_name(tree, loc[1], loc[0]) if named else None
@@ -295,27 +287,28 @@ def _describe(model: type[Table], prefix: str) -> Iterator[KeyInfo]:
         below, path = table_in(field.annotation), f"{prefix}{key}"
         if below is not None:
             yield from _describe(below, f"{path}.")
-        elif not is_explained_elsewhere(path):
+        elif not _explained_at(path):
             default = "" if field.is_required() else shown(field.default)
             default = "none" if default == "None" else default
-            also = tuple(item for item in ("arms", "joints") if _explains(path, f"{item}.{key}"))
+            tables = ("arms", "joints", "closures")
+            also = tuple(item for item in tables if _explained_at(f"{item}.{key}") == prefix[:-1])
             told = allowed_words(field), default, str(field.description)
             yield KeyInfo(path, *told, also)
 
 
-def is_explained_elsewhere(path: str) -> bool:
-    """Return whether a key means what that of another table means, where it is explained.
+def _explained_at(path: str) -> str:
+    """Return the table at which a key is explained that means the same in another one.
 
     Arms state their own material, and [[joints]] the drives that arms state in the plane.
     """
     table, _, key = path.rpartition(".")
-    return (table == "arms" and key in material_keys()) or (table == "joints" and key in DRIVE_KEYS)
-
-
-def _explains(path: str, other: str) -> bool:
-    """Return whether what one key means is told at another one."""
-    place = {"arms": "material", "joints": "arms"}[other.partition(".")[0]]
-    return path.rpartition(".")[0] == place and is_explained_elsewhere(other)
+    same = {
+        "arms": ("material", material_keys()),
+        "joints": ("arms", DRIVE_KEYS),
+        "closures": ("joints", ("name", "rpy")),
+    }
+    place, keys = same.get(table, ("", ()))
+    return place if key in keys else ""
 
 
 # -- what a scene does not state and its results depend on --------------------------------------

@@ -5,45 +5,46 @@ The tree is the scene as read, before it is validated: values of any type may st
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from dolfinopt.errors import InputError
-from dolfinopt.scene.tables import closures
-from dolfinopt.scene.tables.base import rows
+from dolfinopt.scene.tables.base import input_error, rows
 from dolfinopt.scene.tables.joints import INBOARD, OUTBOARD, site_of
-from dolfinopt.scene.tables.responses import OLD_KINDS, OLD_LIMITS
+from dolfinopt.scene.tables.machine import GROUND
+from dolfinopt.scene.toml import tomllib
 
 Tree = dict[str, Any]
 Row = dict[str, Any]
-
-
-# Tree, row of the older key, key of now and the older value; returns that of now, None: none.
-Translation = Callable[[Tree, Row, str, Any], Any]
-
-
-def _same(tree: Tree, row: Row, key: str, value: Any) -> Any:
-    return value
+CLOSURE = "closure"  # an older table, and the name of what it states in others
+OLD_CLOSURE = (
+    "[closure] is read as one of [[closures]], closure.direction as its axis, closure.force as the "
+    'factor of the force "closure" among [[forces]]; state those'
+)
+OLD_KINDS = {"compliance": "integral_compliance", "first_frequency": "eigenfrequency"}
 
 
 @dataclass(frozen=True)
 class OldWord:
-    """An older key.
+    """An older key, see old_words.toml.
 
     Attributes:
         old: dotted key.
         new: dotted key of now; "": it has no effect.
-        value: what that has.
         words: what it is now, for people, where `new` does not say it.
         default: value that it had where it was not stated, which is not told.
+        only_with: another key of its table, and the value of that with which it has an effect.
     """
 
     old: str
-    new: str
-    value: Translation = _same
+    new: str = ""
     words: str = ""
     default: Any = None
+    only_with: tuple[str, Any] | None = None
 
     @property
     def told(self) -> str:
@@ -57,11 +58,20 @@ class OldWord:
 
     def put(self, tree: Tree, row: Row, value: Any) -> None:
         """Put the value of a row of its table in the place of now."""
+        if self.only_with and row.get(self.only_with[0]) != self.only_with[1]:
+            return
         table, key = self.new.split(".")
-        result = self.value(tree, row, key, value)
+        translation = TRANSLATIONS.get(self.old)
+        result = translation(tree, row, key, value) if translation else value
         target = row if table == self.old.partition(".")[0] else tree.setdefault(table, {})
         if result is not None:
             target[key] = result
+
+
+# -- values that are other ones now --------------------------------------------------------------
+
+# Tree, row of the older key, key of now and the older value; returns that of now, None: none.
+Translation = Callable[[Tree, Row, str, Any], Any]
 
 
 def scaled(value: Any, factor: Any) -> Any:
@@ -86,27 +96,50 @@ def _site(tree: Tree, row: Row, key: str, value: Any) -> str:
     return name if str(value).casefold() == OUTBOARD else f"{name}.{value}"
 
 
-def _symmetric_z(tree: Tree, row: Row, key: str, value: Any) -> Any:
+def _symmetric(words: Mapping[bool, Any], tree: Tree, row: Row, key: str, value: Any) -> Any:
+    """Return `symmetric` of one more symmetry: by whether the arm has that about y = 0."""
     arms = rows(tree, "arms")
     before = arms[max(0, arms.index(row) - 1)] if key not in row else row
-    about_y = before.get(key) in (True, "yz")
-    return ("yz" if about_y else "z") if value else about_y
+    about_y = before.get(key) in (True, "yz", "y-extruded")
+    return words[about_y] if value else about_y
 
 
-def _only_with(key: str, *values: Any) -> Translation:
-    """Return the translation of a key that has an effect with some values of another one alone."""
-    return lambda tree, row, _, value: value if row.get(key) in values else None
+def _bore(name: str, tree: Tree, row: Row, key: str, value: Any) -> list[Row]:
+    given = value if isinstance(value, Mapping) else {}
+    others = row.get(key) or []
+    known: Row = next((other for other in others if other.get("name") == name), {})
+    first = {"name": name, **known, **given}
+    return [first, *(other for other in others if other.get("name") != name)]
 
 
-def _bore(name: str) -> Translation:
-    def interfaces(tree: Tree, row: Row, key: str, value: Any) -> list[Row]:
-        given = value if isinstance(value, Mapping) else {}
-        others = row.get(key) or []
-        known: Row = next((other for other in others if other.get("name") == name), {})
-        first = {"name": name, **known, **given}
-        return [first, *(other for other in others if other.get("name") != name)]
+def _body(tree: Tree, row: Row, key: str, value: Any) -> Any:
+    row.pop("cells", None)
+    return value
 
-    return interfaces
+
+def _turned(tree: Tree, row: Row, key: str, value: Any) -> Any:
+    """Return roll, pitch and yaw of a turn about an axis; give them to arms that state no axis."""
+    if not tree.get("joints"):
+        return None  # in the plane there is one axis
+    arms, material = rows(tree, "arms"), tree.get("material")
+    for arm in arms if row is material else arms[arms.index(row) + 1 :]:
+        if "angle_axis" in arm:
+            break
+        if key in arm:
+            arm[key] = _roll_pitch_yaw(value, arm[key])
+    usual = material.get(key) if isinstance(material, dict) else None
+    return _roll_pitch_yaw(value, row.get(key, usual))
+
+
+def _roll_pitch_yaw(axis: Any, angle: Any) -> Any:
+    from scipy.spatial.transform import Rotation  # which newer scenes do not need
+
+    try:
+        size = math.hypot(*axis)
+        turn = Rotation.from_rotvec([angle * x / size for x in axis])
+        return turn.as_euler("xyz").tolist()
+    except (TypeError, ValueError, ZeroDivisionError):
+        return angle  # as it is, which may be refused
 
 
 def _way(tree: Tree, row: Row, key: str, value: Any) -> Any:
@@ -114,7 +147,7 @@ def _way(tree: Tree, row: Row, key: str, value: Any) -> Any:
 
 
 def _eroded(tree: Tree, row: Row, key: str, value: Any) -> str | None:
-    return f"robust-{value}" if row.get(key) == "robust" and value != "nominal" else None
+    return None if value == "nominal" else f"robust-{value}"
 
 
 def _first_mode(tree: Tree, row: Row, key: str, value: Any) -> Any:
@@ -129,68 +162,58 @@ def _exact(tree: Tree, row: Row, key: str, value: Any) -> str | None:
     return "exact" if value else None
 
 
-BY_RADAU = "every motion is integrated by Radau IIA"
-CURVES = "parts have lines, arcs and circles"
-OLD_WORDS = (
-    OldWord("arms.joint_stiffness", "arms.gear_stiffness", default=0.0),
-    OldWord("arms.joint_damping", "arms.gear_damping", default=0.0),
-    OldWord("arms.symmetric_z", "arms.symmetric", _symmetric_z,
-            'arms.symmetric = "z", "yz" about both planes', False),
-    OldWord("arms.pattern", "arms.design"),
-    OldWord("arms.hull", "arms.hollow", words="arms.hollow = its file"),
-    OldWord("arms.section", "arms.hollow", words="arms.hollow = the section"),
-    OldWord("arms.inboard_bore", "arms.interfaces", _bore(INBOARD),
-            'an entry "inboard" of [[arms.interfaces]]'),
-    OldWord("arms.outboard_bore", "arms.interfaces", _bore(OUTBOARD),
-            'an entry "outboard" of [[arms.interfaces]]'),
-    OldWord("joints.parent_interface", "joints.parent", _site,
-            'joints.parent = "arm.interface"', OUTBOARD),
-    OldWord("payload.interface", "payload.arm", _site, 'payload.arm = "arm.interface"', OUTBOARD),
-    OldWord("forces.interface", "forces.arm", _site, 'forces.arm = "arm.interface"', OUTBOARD),
-    OldWord("closures.direction", "closures.axis"),
-    OldWord("reduction.shifts", "reduction.frequencies", _only_with("method", "krylov"),
-            default=[0.0]),
-    OldWord("reduction.band", "reduction.frequencies", _only_with("method", "balanced"),
-            default=[0.0, 50.0]),
-    OldWord("control.stiffness_factor", "control.stiffness", _scaled,
-            "control.stiffness times it", 1.0),
-    OldWord("control.damping_factor", "control.damping", _scaled, "control.damping times it", 1.0),
-    OldWord("optimizer.exact_iterations", "objective.gradient", _exact,
-            'objective.gradient = "exact"', 0),
-    OldWord("simulation.integrator", "", words=BY_RADAU, default="radau"),
-    OldWord("design.limits_on", "design.projection", _eroded,
-            'design.projection = "robust-eroded"', "nominal"),
-    OldWord("objective.follow", "objective.modes", _first_mode, 'objective.modes = "first"', False),
-    OldWord("closures.side", "motion.elbow", _way),
-    OldWord("motion.base_position", "motion.base", _only_with("base", "fixed"),
-            "motion.base = the number", 0.0),
-    OldWord("motion.start_angle", "motion.initial_joints", _first_joint,
-            "motion.initial_joints = [it]", 0.0),
-    OldWord("constraints.path_speed", "motion.max_speed"),
-    OldWord("constraints.path_acceleration", "motion.max_acceleration"),
-    OldWord("constraints.path_jerk", "motion.max_jerk"),
-    OldWord("part.iterations", "part.optimize", _only_with("optimize", True),
-            "part.optimize = the number", 80),
-    OldWord("simulation.stages", "", words="steps have four stages", default=4),
-    OldWord("part.curves", "", words=CURVES, default="splines"),
-    OldWord("part.simplify", "", words=CURVES, default=False),
-    OldWord("simulation.rho_inf", "", words=BY_RADAU, default=0.8),
-    *(OldWord(f"constraints.{old}", f"constraints.{key}") for old, key in OLD_LIMITS.items()),
-)  # fmt: skip
-OLD_KEYS = {word.old for word in OLD_WORDS}
+def _error(tree: Tree, row: Row, key: str, value: Any) -> Any:
+    return None if isinstance(row.get(key, 1), int) else value
+
+
+TRANSLATIONS: Mapping[str, Translation] = {
+    "arms.symmetric_z": partial(_symmetric, {True: "yz", False: "z"}),
+    "arms.extruded": partial(_symmetric, {True: "y-extruded", False: "extruded"}),
+    "arms.sid": _body,
+    "arms.inboard_bore": partial(_bore, INBOARD),
+    "arms.outboard_bore": partial(_bore, OUTBOARD),
+    "arms.angle_axis": _turned,
+    "material.angle_axis": _turned,
+    "joints.parent_interface": _site,
+    "payload.interface": _site,
+    "forces.interface": _site,
+    "closures.side": _way,
+    "reduction.tolerance": _error,
+    "control.stiffness_factor": _scaled,
+    "control.damping_factor": _scaled,
+    "optimizer.exact_iterations": _exact,
+    "design.limits_on": _eroded,
+    "objective.follow": _first_mode,
+    "motion.start_angle": _first_joint,
+}
+
+_FILE = Path(__file__).with_name("old_words.toml")
+OLD_WORDS = tuple(
+    OldWord(old, **entry) for old, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
+)
+
+
+def is_old(path: tuple[Any, ...]) -> bool:
+    """Return whether a path of a scene is that of an older key, or lies below one."""
+    keys = [str(part) for part in path if not isinstance(part, int)]
+    return keys[0] == CLOSURE or any(word.old == ".".join(keys[:2]) for word in OLD_WORDS)
 
 
 def in_new_words(key: str) -> str:
     """Return a dotted key in the words of now, as --set takes it; one of now as it is."""
-    key = closures.in_new_words(key)
     place, _, name = key.rpartition(".")
     table = place.partition(".")[0]
     word = next((item for item in OLD_WORDS if item.old == f"{table}.{name}"), None)
-    if word is not None and word.value is _scaled:
+    if word is None:
+        return f"closures.0.{name}" if place == CLOSURE else key
+    if TRANSLATIONS.get(word.old) is _scaled:
         return f"{place}.{word.new.rpartition('.')[2]}*"
-    if word is None or word.words:
+    if word.words:
         return key
     return f"{place}.{word.new.rpartition('.')[2]}" if word.is_renamed else word.new
+
+
+# -- a scene's data ------------------------------------------------------------------------------
 
 
 def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
@@ -204,7 +227,7 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
     Raises:
         InputError: a scene states older and newer word of the same.
     """
-    told = []
+    told = _read_closure(tree, source, anew)
     for word in OLD_WORDS:
         table, key = word.old.split(".")
         for row in rows(tree, table):
@@ -218,7 +241,7 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
                 # A stated default counts where else another value would: the arm before's, or
                 # that of a guess.
                 known = word.new.rpartition(".")[2]
-                guessed = word.value is _first_joint and row.get(known) is not None
+                guessed = key == "start_angle" and row.get(known) is not None
                 stated = known not in row if table == "arms" else guessed
                 if anew or not unset or stated:
                     word.put(tree, row, value)
@@ -243,3 +266,40 @@ def _refuse_both(row: Row, word: OldWord, source: str) -> None:
         raise InputError(
             f"{source}: {word.old}: expected only one of it and {word.new}: they are the same"
         )
+
+
+def _read_closure(tree: Tree, source: str, anew: bool) -> list[str]:
+    """Put [closure] in its places: [[closures]], and `force` in [[forces]]."""
+    if (table := tree.pop(CLOSURE, None)) is None:
+        return []
+    others = not anew and (tree.get("closures") or tree.get("joints"))
+    if others or not isinstance(table, dict):
+        raise input_error(source, "closure: expected [[closures]], of which it is an older word")
+    last = [arm.get("name") for arm in rows(tree, "arms")][-1:]
+    tree["closures"] = tree.get("closures") or [{"name": CLOSURE, "between": [*last, GROUND]}]
+    for row in rows(tree, "closures")[:1]:
+        before, load = _unit(row.get("axis")), table.pop("force", None)
+        row.update({"axis" if key == "direction" else key: x for key, x in table.items()})
+        if row.get("kind") == "slider":
+            row.setdefault("axis", [1.0, 0.0])
+        elif row.get("axis") == [1.0, 0.0]:
+            del row["axis"]  # the default of a line
+        forces = [force for force in rows(tree, "forces") if force.get("name") == CLOSURE]
+        if load and not forces:
+            forces = [{"name": CLOSURE, "arm": last[0]}]
+            tree["forces"] = [*(tree.get("forces") or []), *forces]
+        for force in forces:
+            if load is not None:
+                force["factor"] = load
+            if load is not None or force.get("force") == before:
+                force["force"] = _unit(row.get("axis"))
+    return [OLD_CLOSURE]
+
+
+def _unit(axis: Any) -> list[float]:
+    """Return an axis of the plane of length 1; along x where it is none, which is refused."""
+    try:
+        size = math.hypot(*axis[:2])
+        return [x / size for x in axis[:2]]
+    except (TypeError, ZeroDivisionError):
+        return [1.0, 0.0]

@@ -77,10 +77,12 @@ def region_problem(arm: Arm, cells: Cells) -> tuple[int, str] | None:
     both interfaces are joined by cells that may be solid, and so is every cell that must be.
     """
     result = region_cells(arm, cells.centroid)
+    y, z = 0.5 * arm.height, 0.5 * arm.thickness
     for number, inside in enumerate(result.each):
         if not inside.any():
             return number, (
-                "expected a place in the arm and the size of a cell at least: it covers the "
+                f"expected a place in the arm, x from 0 to {arm.length:g}, y from {-y:g} to {y:g}, "
+                f"z from {-z:g} to {z:g} [m], and the size of a cell at least: it covers the "
                 "centroid of no cell"
             )
     solid = cells.passive | result.solid

@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Annotated, Any, get_args
 
 from pydantic import AfterValidator, Field, PrivateAttr, field_validator
+from pydantic.json_schema import GenerateJsonSchema
 
 from dolfinopt import version
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
-from dolfinopt.scene.tables.arms import Arm
-from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, setting, table_in
+from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
+from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, setting, table_in
 from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
@@ -217,11 +218,6 @@ class Scene(Table):
         return 3 if self.is_spatial else 2
 
     @property
-    def estimates_stiffening(self) -> bool:
-        """Whether its effect is told where it is stated; most of a solid arm's memory would go."""
-        return not self.is_spatial
-
-    @property
     def arm_sizes(self) -> tuple[str, ...]:
         """Keys of an arm that give its cells other sizes; in the plane thickness is a factor."""
         plane = ("length", "height", "mesh_size", "passive")
@@ -281,7 +277,7 @@ class Scene(Table):
     @property
     def rods(self) -> tuple[Closures, ...]:
         """Rods whose length is a rigid coordinate, behind those of the joints."""
-        return tuple(closure for closure in self.closures if closure.has_coordinate)
+        return tuple(item for item in self.closures if item.driven or item.is_spring)
 
     @property
     def rigid_units(self) -> dict[str, str]:
@@ -364,6 +360,8 @@ class Scene(Table):
         # Not by min_length: pydantic would also count arms that are there but invalid as absent.
         if not arms:
             raise ValueError
+        if len(arms) > MAX_ARMS:
+            raise Refusal(f"expected at most {MAX_ARMS} of them, found {len(arms)}")
         result: dict[str | None, Arm] = {}
         for arm in arms:  # those of one name are refused later
             result[arm.name] = arm.like(result.get(arm.design))
@@ -394,11 +392,6 @@ FILE_KEYS = tuple(
 )
 
 
-def file_in(key: str, value: str) -> bool:
-    """Return whether the value of one of `FILE_KEYS` is a file, not a word as "tube" is."""
-    return key != "hollow" or Path(value).suffix != ""
-
-
 # -- the keys of a scene as JSON schema, from which editors complete and check scene files -------
 
 SCHEMA_FILE = "dolfinopt.schema.json"
@@ -409,7 +402,9 @@ def scene_schema() -> dict[str, Any]:
 
     It knows keys, types and ranges; what depends on several keys is checked when a scene is read.
     """
-    schema = _plain(Scene.model_json_schema(ref_template="#/definitions/{model}"))
+    schema = Scene.model_json_schema(
+        ref_template="#/definitions/{model}", schema_generator=TomlSchema
+    )
     schema["definitions"] = schema.pop("$defs")
     schema["required"].remove("name")  # by default the file's
     schema["properties"]["arms"]["minItems"] = 1
@@ -425,28 +420,33 @@ def scene_schema() -> dict[str, Any]:
         "anyOf": [{"type": "string", "enum": list(CATALOGUE)}, schema["properties"]["material"]]
     }
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "scene of dolfinopt"}
-    return head | {key: value for key, value in schema.items() if key != "title"}
+    return head | schema
 
 
-def _plain(node: Any) -> Any:
-    """Return a part of pydantic's schema without null, which TOML lacks, and in draft 7's words."""
-    if isinstance(node, list):
-        return [_plain(item) for item in node]
-    if not isinstance(node, dict):
-        return node
-    if "anyOf" in node:
-        kinds = [kind for kind in node["anyOf"] if kind != {"type": "null"}]
-        rest = {key: value for key, value in node.items() if key != "anyOf"}
-        node = rest | (kinds[0] if len(kinds) == 1 else {"anyOf": kinds})
-    result = {}
-    for key, value in node.items():
-        if key == "properties":
-            result[key] = {name: _plain(item) for name, item in value.items()}
-        elif key == "prefixItems":
-            result["items"] = _plain(value)
-        elif key != "title" and (key, value) != ("default", None):
-            result[key] = _plain(value)
-    return result
+class TomlSchema(GenerateJsonSchema):
+    """JSON schema without null, which TOML lacks, and titles, and in the words of draft 7."""
+
+    def nullable_schema(self, schema: Any) -> dict[str, Any]:
+        return self.generate_inner(schema["schema"])
+
+    def tuple_schema(self, schema: Any) -> dict[str, Any]:
+        result = super().tuple_schema(schema)
+        if "prefixItems" in result:
+            result["items"] = result.pop("prefixItems")
+        return result
+
+    def default_schema(self, schema: Any) -> dict[str, Any]:
+        result = super().default_schema(schema)
+        if result.get("default", 0) is None:
+            del result["default"]
+        return result
+
+    def model_schema(self, schema: Any) -> dict[str, Any]:
+        result = super().model_schema(schema)
+        return {key: value for key, value in result.items() if key != "title"}
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        return False
 
 
 def flattened(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
@@ -473,13 +473,12 @@ def program() -> list[str | int]:
 def named_files(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], str]]:
     """Yield dotted key, table and key of every file that a scene's data names."""
     for table, key in FILE_KEYS:
-        node = data.get(table)
-        rows = node if isinstance(node, list) else [node]
-        for k, row in enumerate(rows):
-            value = row.get(key) if isinstance(row, dict) else None
-            if isinstance(value, str) and file_in(key, value):
-                name = f"{table}.{k}.{key}" if isinstance(node, list) else f"{table}.{key}"
-                yield name, row, key
+        for k, row in enumerate(rows(data, table)):
+            value = row.get(key)
+            # A word of arms.hollow, such as "tube", is none.
+            if isinstance(value, str) and (key != "hollow" or Path(value).suffix):
+                place = f"{table}.{k}" if isinstance(data[table], list) else table
+                yield f"{place}.{key}", row, key
 
 
 def with_digests(data: Mapping[str, Any]) -> dict[str, Any]:

@@ -488,10 +488,9 @@ class _Reader:
             raise self.fail(f"no m0 in {name}, whose structure 0 says zero")
         M0 = np.eye(*shape) if structure == UNIT and not first else np.zeros(shape)
         M1 = np.zeros((shape[0], count, shape[1]))
-        for (row, col), value in first.items():
-            M0[row, col] = value
-            if structure == SYMMETRIC and shape[0] == shape[1] and (col, row) not in first:
-                M0[col, row] = value
-        for index, value in second.items():
-            M1[index] = value
+        if structure == SYMMETRIC and shape[0] == shape[1]:
+            first = {index[::-1]: value for index, value in first.items()} | first
+        for array, values in ((M0, first), (M1, second)):
+            for index, value in values.items():
+                array[index] = value
         return Taylor(M0, M1, order, structure, nqn)

@@ -1,15 +1,12 @@
-"""TOML: files of scenes and their values."""
+"""TOML: files of scenes."""
 
 from __future__ import annotations
 
-import json
-import os
 import re
 import sys
-from collections.abc import Mapping
 from typing import Any
 
-from dolfinopt.scene.tables.base import input_error
+from dolfinopt.scene.tables.base import input_error, toml_value
 from dolfinopt.scene.text import read_text
 
 if sys.version_info >= (3, 11):
@@ -40,27 +37,3 @@ def _syntax_error(message: str, text: str) -> str:
     if line is None:
         line, column = text.count("\n") + 1, len(text) - text.rfind("\n")
     return f"line {line}, column {column}: not valid TOML: {message[: result.start()]}"
-
-
-def toml_value(value: Any) -> str:
-    """Return a value as TOML: numbers, also NumPy's, texts, paths, arrays and tables.
-
-    Entries that are None are left out.
-
-    Raises:
-        TypeError: TOML has no such values.
-    """
-    if hasattr(value, "tolist"):  # NumPy's
-        value = value.tolist()
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, (int, float)):
-        return repr(value)
-    if isinstance(value, (str, os.PathLike)):
-        return json.dumps(os.fspath(value), ensure_ascii=False)
-    if isinstance(value, Mapping):
-        pairs = (f"{key} = {toml_value(item)}" for key, item in value.items() if item is not None)
-        return f"{{ {', '.join(pairs)} }}"
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(toml_value(item) for item in value if item is not None)}]"
-    raise TypeError(f"{type(value).__name__}: no value of a scene")

@@ -11,7 +11,6 @@ from typing import Any
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import scene_from_dict
 from dolfinopt.scene.old_words import read_old_words
-from dolfinopt.scene.tables.closures import read_old_closure
 from dolfinopt.scene.toml import read_toml, toml_value, tomllib
 
 HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z0-9_.-]+)\s*\]{1,2}\s*(#.*)?$")
@@ -20,12 +19,15 @@ KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")
 
 @dataclass
 class Block:
-    """Lines of a table in a file: its header's, and first and last ones of its keys."""
+    """A table of a file, or the keys before all tables.
+
+    Attributes:
+        path: dotted; "" of the keys before all tables.
+        lines: its text in pieces, each with its key; "" of headers, comments and blank lines.
+    """
 
     path: str
-    first: int
-    last: int
-    keys: dict[str, tuple[int, int]] = field(default_factory=dict)
+    lines: list[tuple[str, str]] = field(default_factory=list)
 
 
 def upgraded(source: str) -> tuple[str, list[str]]:
@@ -35,13 +37,22 @@ def upgraded(source: str) -> tuple[str, list[str]]:
         InputError: no valid scene, or one that this cannot rewrite.
     """
     old = read_toml(source)
-    before = scene_from_dict(copy.deepcopy(old), source)
+    before = scene_from_dict(old, source)
     new = copy.deepcopy(old)
-    read_old_closure(new, source)
-    new = {key: value for key, value in new.items() if value is not True}
     told = read_old_words(new, source)
     with open(source, encoding="utf-8-sig") as file:
-        text = _rewritten(file.read(), old, new)
+        blocks = _blocks(file.read())
+    for table, value in old.items():
+        own = [block for block in blocks if block.path == table]
+        after = new.get(table, [{}] * len(own))
+        pairs = zip(value, after) if isinstance(value, list) else [(value, after)]
+        for (row, other), block in zip(pairs, own):
+            if isinstance(row, Mapping) and row != other:
+                _rewrite(block, row, other if table in new else None)
+        gone = {f"{table}.{key}" for key in _keys(value) - _keys(new.get(table))}
+        blocks = [block for block in blocks if block.path not in gone]
+    blocks += _added(old, new)
+    text = "".join(piece for block in blocks for _, piece in block.lines)
     try:
         same = scene_from_dict(tomllib.loads(text), source) == before
     except (InputError, ValueError):
@@ -51,64 +62,43 @@ def upgraded(source: str) -> tuple[str, list[str]]:
     return text, list(before.old_words)
 
 
-def _rewritten(text: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> str:
-    lines = text.splitlines()
-    edits: dict[int, list[str]] = {}  # line: what takes its place
-    blocks = _blocks(lines)
-    for table, value in old.items():
-        own = [block for block in blocks if block.path == table]
-        if table not in new:
-            for block in own:
-                edits |= {k: [] for k in range(block.first, block.last + 1)}
-                edits[block.first] = _added(old, new)
-            continue
-        rows = value if isinstance(value, list) else [value]
-        others = new[table] if isinstance(value, list) else [new[table]]
-        for row, other, block in zip(rows, others, own):
-            if isinstance(row, Mapping) and row != other:
-                edits |= _edited(lines, blocks, block, row, other)
-    return "\n".join(x for k, line in enumerate(lines) for x in edits.get(k, [line])) + "\n"
+def _keys(value: Any) -> set[str]:
+    """Return the keys of a table, or of all rows of an array of tables."""
+    rows = value if isinstance(value, list) else [value]
+    return {key for row in rows if isinstance(row, Mapping) for key in row}
 
 
-def _added(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Return the lines of tables, and rows of them, that an older table became."""
+def _rewrite(block: Block, row: Mapping[str, Any], other: Mapping[str, Any] | None) -> None:
+    """Change the lines of a table that hold another value now; None: the table goes."""
+    if other is None:
+        block.lines.clear()
+        return
+    fresh = [key for key in other if key not in row]
     lines = []
+    for key, text in block.lines:
+        if not key or (key in other and other[key] == row[key]):
+            lines.append((key, text))
+        elif key in other or fresh:  # a new key takes the place of one that goes
+            name = key if key in other else fresh.pop(0)
+            lines.append((name, f"{name} = {toml_value(other[name])}{_comment(text)}\n"))
+    block.lines = [*lines[:1], *((k, f"{k} = {toml_value(other[k])}\n") for k in fresh), *lines[1:]]
+
+
+def _added(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Block]:
+    """Return tables, and rows of arrays of them, that older ones became."""
+    result = []
     for table, value in new.items():
-        known = old.get(table, [])
-        for row in value[len(known) :] if isinstance(value, list) else []:
-            lines += [f"[[{table}]]", *(f"{k} = {toml_value(x)}" for k, x in row.items()), ""]
-    return lines
+        rows = value[len(old.get(table, [])) :] if isinstance(value, list) else [value]
+        header = f"[[{table}]]" if isinstance(value, list) else f"[{table}]"
+        for row in rows if isinstance(value, list) or table not in old else []:
+            lines = [f"{key} = {toml_value(item)}" for key, item in row.items()]
+            result.append(Block(table, [("", "\n".join(["", header, *lines, ""]))]))
+    return result
 
 
-def _edited(
-    lines: list[str], blocks: list[Block], block: Block, row: Mapping[str, Any], other: Any
-) -> dict[int, list[str]]:
-    """Return the edits of a table's lines that make it another; its comments stay."""
-    fresh = [f"{k} = {toml_value(x)}" for k, x in other.items() if k not in row]
-    edits: dict[int, list[str]] = {}
-    for key in row:
-        if key in other and row[key] == other[key]:
-            continue
-        if key in block.keys:
-            first, last = block.keys[key]
-        else:  # a table of its own below this one
-            below = next(
-                b for b in blocks if b.path == f"{block.path}.{key}" and b.first > block.first
-            )
-            first, last = below.first, below.last
-        mine = [f"{key} = {toml_value(other[key])}"] if key in other else []
-        if key not in other and fresh and key in block.keys:
-            mine, fresh = fresh[:1], fresh[1:]
-        edits |= {k: [] for k in range(first, last + 1)}
-        note = _comment(lines[last]) if key in block.keys else ""
-        edits[first] = [f"{item}{note}" for item in mine]
-    if fresh:
-        edits[block.first] = [lines[block.first], *fresh]
-    return edits
-
-
-def _comment(line: str) -> str:
-    """Return the comment at the end of a line of a key or the rest of its value."""
+def _comment(text: str) -> str:
+    """Return the comment behind the value of a key."""
+    line = text.splitlines()[-1]
     for place in re.finditer(r"\s*#", line):
         head = line[: place.start()]
         if head.count('"') % 2 == 0 and head.count("'") % 2 == 0:
@@ -116,19 +106,18 @@ def _comment(line: str) -> str:
     return ""
 
 
-def _blocks(lines: list[str]) -> list[Block]:
+def _blocks(text: str) -> list[Block]:
     """Return the tables of a file; the first one holds the keys before all headers."""
-    blocks, k = [Block("", 0, 0)], 0
-    while k < len(lines):
-        if header := HEADER.match(lines[k]):
-            blocks.append(Block(header[1], k, k))
-        elif key := KEY.match(lines[k]):
-            first = k
-            while not _is_complete("\n".join(lines[first : k + 1])) and k + 1 < len(lines):
-                k += 1
-            blocks[-1].keys[key[1]] = first, k
-            blocks[-1].last = k
-        k += 1
+    blocks, pending = [Block("")], ""
+    for line in text.splitlines():
+        pending += f"{line}\n"
+        key = KEY.match(pending)
+        if key and not _is_complete(pending):
+            continue  # a value over several lines
+        if header := HEADER.match(line):
+            blocks.append(Block(header[1]))
+        blocks[-1].lines.append((key[1] if key else "", pending))
+        pending = ""
     return blocks
 
 

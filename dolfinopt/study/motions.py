@@ -136,7 +136,7 @@ def _judged(scene: Scene) -> Scene:
 
 def _finer_deviation(scene: Scene, place: Place) -> float | None:
     """Return the largest deviation in a finer model with this one's corrections, m."""
-    if isinstance(scene.reduction.coordinates, str):
+    if not scene.reduction.count:
         return None
     corrections = None
     if scene.feed_forward.on:

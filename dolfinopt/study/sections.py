@@ -152,7 +152,7 @@ class Members:
         none = ("mesh", "element", "mesh_size", "cell_shape", "cells", "passive",
                 "interface_offset", *WALL_KEYS)  # fmt: skip
         row: dict[str, Any] = dict.fromkeys(none)
-        row |= {"symmetric": False, "extruded": False, "hollow": False, "mesh_scale": 1.0}
+        row |= {"symmetric": False, "hollow": False, "mesh_scale": 1.0}
         row |= {"regions": [], "interfaces": [], "design": arm.design if arm.shares else None}
         if self.section.plane is None:
             height, thickness = self.section.measures(arm.height, arm.thickness, share)
@@ -453,7 +453,7 @@ def _check_replaceable(scene: Scene) -> None:
         where, angle = f"{scene.source}: arms.{arm.name}", scene.material_of(index).angle
         if scene.is_spatial and arm.flexible and angle:
             raise InputError(
-                f"{where}.angle: sections: expected 0 in space, found {angle:.4g} rad; the fibres "
+                f"{where}.angle: sections: expected 0 in space, found {angle} rad; the fibres "
                 "of a member are along it"
             )
         if arm.flexible and arm.further_interfaces:

@@ -281,7 +281,8 @@ def test_widths_need_three_cells_of_a_step_file_without_a_size(tmp_path):
 @pytest.mark.parametrize("extruded", [False, True])
 def test_widths_of_solid_arms_are_measured_where_they_are_asked_for(extruded):
     """Of a design that is the same over the thickness in the plane: the arm's own is no member."""
-    told = {"cells": (20, 12, 2), "height": 0.06, "thickness": 0.01, "extruded": extruded}
+    told = {"cells": (20, 12, 2), "height": 0.06, "thickness": 0.01}
+    told["symmetric"] = "extruded" if extruded else False
     scene = solid_scene(**told)
     width = {"projection": "robust", "minimum_member": 0.015}
     asked = scene.unchecked_copy(

@@ -139,9 +139,7 @@ def test_least_damping_follows_the_control():
     """More derivative gain, more damping; the limit is met or not, and told so."""
     ratios = []
     for factor in (0.5, 1.0):
-        changes = (f"control.damping_factor={factor}", "constraints.damping_ratio=0.05",
-                   "constraints.damping_below=20.0")  # fmt: skip
-        scene = controlled(*changes)
+        scene = controlled(f"control.damping_factor={factor}", "constraints.damping_ratio=0.05")
         result = do.Model(scene).simulate()
         again = result.state_space(1.0)
         assert again is not None and np.array_equal(again.A, state_space(result.trajectory, 1.0).A)
@@ -150,7 +148,6 @@ def test_least_damping_follows_the_control():
             for t in scene.constraints.pole_instants(scene.motion)
         ]
         every = np.concatenate(poles)
-        every = every[np.abs(every) < 2.0 * np.pi * 20.0]
         (measured,) = result.evaluation.values_of("damping_ratio")
         assert measured == pytest.approx((-every.real / np.abs(every)).min(), rel=1e-9)
         assert (result.evaluation.constraints[-1] <= 0.0) == (measured >= 0.05)

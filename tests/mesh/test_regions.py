@@ -103,7 +103,7 @@ def test_regions_are_drawn():
         ('{kind="void", circle=[0.5,0,0.0]}', "regions.0.circle", "three numbers"),
         ('{kind="void", round=[0.5,0,0.01]}', "unknown key arms.0.regions.0.round", "kind, box"),
         ('{kind="void", circle=[500,0,10]}', "regions.0.circle", "x from 0 to 1"),
-        ('{kind="void", circle=[0.5,0.05,0.01]}', "regions.0.circle", "y from -0.03 to 0.03 [m]"),
+        ('{kind="void", circle=[0.5,0.05,0.01]}', "regions.0.circle", "y from -0.03 to 0.03"),
         ('{kind="void", circle=[0.5,0,0.001]}', "regions.0.circle", "centroid of no cell"),
         (f"{HOLE}, {HOLE.replace('void', 'solid')}", "regions.0.circle", "solid region"),
         ('{kind="void", circle=[0.02,0,0.03]}', "regions.0.circle", "arms.passive"),
@@ -192,5 +192,6 @@ def test_regions_of_solids_have_a_depth(symmetric):
     ],
 )
 def test_depths_that_cannot_be(region, word):
-    changes = f"arms.link1.regions=[{region}]", f"arms.extruded={str(word == 'extruded').lower()}"
+    design = "extruded" if word == "extruded" else "false"
+    changes = f"arms.link1.regions=[{region}]", f"arms.symmetric={design}"
     refusal(lambda: do.load_scene(SPACE, (*BLOCK, *changes)), word)

@@ -223,34 +223,17 @@ def walled(**keys):
     return solid_arm(MPI.COMM_SELF, hollow=True, wall=0.001, max_wall=0.003, **keys)
 
 
-def test_ribs_are_rings_at_even_distances():
-    """Two cells long; the station between them is as thick as the largest wall, its next is not."""
-    arm = walled(cells=(12, 3, 2), passive=0.0, ribs=2)
-    x, wall = arm.mesh.centroid[:, 0], arm.mesh.wall
-    at = wall.hull.outer[:, 0, 0]
-    cell = 0.5 / 12
-    near = np.abs(x[:, None] - [0.5 / 3, 1.0 / 3]).min(axis=1) < cell
-    assert np.array_equal(arm.mesh.passive, near)
-    thickness = wall.thickness(MPI.COMM_SELF, arm.uniform())
-    ribs = np.isclose(at[:, None], [0.5 / 3, 1.0 / 3]).any(axis=1)
-    assert ribs.sum() == 2 and thickness[ribs] == pytest.approx(0.003)
-    beyond = np.abs(at[:, None] - at[ribs]).min(axis=1) > 1.5 * cell
-    assert thickness[beyond] == pytest.approx(0.001)
-
-
 @pytest.mark.serial
 @pytest.mark.parametrize(
     "changes, words",
     [
-        (("arms.link1.ribs=2",), ("ribs", "2", "only with hollow")),
-        ((*HOLLOW, "arms.link1.ribs=20"), ("ribs", "20", "at most", "4 from rib to rib")),
         (("arms.link1.wall=0.002",), ("wall", "0.002", "only with hollow")),
         (("arms.link1.hollow=true",), ("wall", "number > 0")),
         ((*HOLLOW, "arms.link1.max_wall=0.01"), ("max_wall", "0.01", "less than half")),
         ((*HOLLOW, "arms.link1.min_wall=0.005"), ("min_wall", "less than max_wall")),
         ((*HOLLOW, "arms.link1.min_wall=0.003"), ("wall", "0.002", "min_wall = 0.003")),
         ((*HOLLOW, "arms.link1.hollow=tube"), ("height", "0.04", "thickness = 0.02")),
-        ((*HOLLOW, "arms.link1.extruded=true"), ("extruded", "default, with hollow")),
+        ((*HOLLOW, "arms.link1.symmetric=extruded"), ("symmetric", "with hollow = true")),
         ((*HOLLOW, "arms.link1.element=quadratic"), ("element", "incompatible")),
         ((*HOLLOW, "arms.link1.cells=[60,60,40]"), ("cells", "at most 150", "200")),
         ((*HOLLOW, "arms.link2.hollow=true", "arms.link2.wall=0.002", "interpolation.penalty=4",

@@ -324,7 +324,7 @@ def test_part_with_a_further_interface_is_a_link_again(tmp_path, plate):
     (tmp_path / "table.csv").write_text("t,swing\n0,0\n0.2,1\n")
     tree = fork() | {"payload": {"mass": 1.0}, "reduction": {"coordinates": 12}}
     link = tree["arms"][0] | {"cells": [20, 6, 4], "interfaces": [side], "passive": 0.03}
-    link |= {"extruded": True} if plate else {}
+    link |= {"symmetric": "extruded"} if plate else {}
     tree |= {"arms": [link], "joints": tree["joints"][:1]}
     tree["forces"] = [{"arm": "link", "interface": "side", "force": [0.0, 500.0, 0.0]}]
     scene = scene_from_dict(tree, str(tmp_path / "link.toml"))

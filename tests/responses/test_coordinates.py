@@ -24,8 +24,8 @@ SHORT = "motion.horizon=1.9"
 
 def auto(*overrides, tolerance=1e-2, cells=(24, 3)):
     linear = "simulation.stiffening=false"  # what is estimated here is the number of modes alone
-    reduced = f"reduction.tolerance={tolerance}"
-    return build(AUTO, reduced, SHORT, linear, *overrides, cells=cells)
+    reduced = f"reduction.coordinates={tolerance}"
+    return build(reduced, SHORT, linear, *overrides, cells=cells)
 
 
 def error(built, x, count):
@@ -71,7 +71,7 @@ SHAKEN = ("damping.stiffness_proportional=1e-5", "payload.mass=2", "motion.durat
 def moved(built, count, method):
     """Return scene and arms by a number of coordinates, to be integrated more finely."""
     data = built.scene.to_dict()
-    data["reduction"] |= {"coordinates": count, "tolerance": 1e-3, "method": method}
+    data["reduction"] |= {"coordinates": count, "method": method}
     data["simulation"]["tolerance"] = 3e-5
     scene = do.scene_from_dict(data)
     return scene, {k: arm.under(scene) for k, arm in built.arms.items()}
@@ -150,22 +150,22 @@ def test_a_given_number_costs_nothing():
 def test_none_is_enough(monkeypatch):
     monkeypatch.setattr(coordinates, "COORDINATES_LIMIT", 6)
     built = auto("reduction.method=modal", tolerance=1e-3)
-    words = "up to 6 coordinates", "reduction.tolerance = 0.001"
+    words = "up to 6 coordinates", "above 0.001"
     with refused(*words, error=do.ConvergenceError):
         choose(built, built.fields(wave))
 
 
 def test_unresolved():
-    """Nothing takes "auto" for a number."""
+    """Nothing takes an error for a number."""
     built = auto()
     for k, arm in built.arms.items():
-        with refused('reduction.coordinates = "auto"', "choose_coordinates"):
+        with refused("reduction.coordinates = ", "choose_coordinates"):
             arm.reduce(built.fields(wave)[k])
 
 
 def small(*overrides, iterations=3):
     settings = ["arms.cells=[24,3]", "motion.horizon=1.9", f"optimizer.max_iterations={iterations}"]
-    return do.load_scene(TWO_ARM, (*settings, "reduction.tolerance=0.01", AUTO, *overrides))
+    return do.load_scene(TWO_ARM, (*settings, "reduction.coordinates=0.01", *overrides))
 
 
 @pytest.mark.serial  # ranks: test_any_number_of_ranks
@@ -173,8 +173,7 @@ def test_optimises_with_the_choice():
     """As with the number; the choice is looked at again in the end."""
     found = do.optimize(small())
     count = found.choice.coordinates
-    stated = f"reduction.coordinates={count}", "reduction.tolerance=0.001"
-    same = do.optimize(small(*stated))
+    same = do.optimize(small(f"reduction.coordinates={count}"))
     assert same.choice is None
     for k in found.x_phys:
         np.testing.assert_array_equal(found.x_phys[k], same.x_phys[k])
@@ -218,7 +217,7 @@ def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
     if written is not None:
         assert written.summary["reduction"]["error_estimate"] == 0.02
         (warning,) = (w for w in written.summary["warnings"] if "filter" not in w)
-        assert "estimated error of 0.02, above reduction.tolerance = 0.01" in warning
+        assert "estimated error of 0.02, above 0.01" in warning
 
 
 @pytest.mark.serial
@@ -229,11 +228,11 @@ def test_commands(tmp_path, capsys):
         run(*words, *overrides("arms.cells=[24,3]", AUTO))
         return capsys.readouterr().out
 
-    sentence = 'reduction.coordinates = "auto": '
+    sentence = "reduction: "
     assert sentence in said("simulate", TWO_ARM, "--no-plots", "--out", tmp_path / "s")
     summary = summary_of(tmp_path / "s")
     found = summary["reduction"]
-    assert found["error_estimate"] <= 1e-3 == summary["scene"]["reduction"]["tolerance"]
+    assert found["error_estimate"] <= 1e-3
     assert summary["scene"]["reduction"]["coordinates"] == "auto"
     assert found["tried"][0]["coordinates"] == 3
     with np.load(tmp_path / "s" / "trajectory.npz") as data:

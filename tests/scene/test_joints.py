@@ -153,9 +153,9 @@ FORKS = [
     (("payload", "interface"), "top", 'payload.arm = "slide.top"', "an interface of slide"),
     (("payload", "arm"), "hand", 'payload.arm = "hand"', "the name of an arm"),
     (("arms", 1, "interfaces", 0, "name"), "Outboard", "arms.1.interfaces", "mesh file of a solid"),
-    (("arms", 1, "interfaces", 0, "radius"), 0.1, "radius", "none with a rigid arm"),
+    (("arms", 1, "interfaces", 0, "radius"), 0.1, "radius", "none: arms made of cells"),
     (("arms", 1, "interfaces"), [SIDE, SIDE], "arms.1.interfaces", "no other interface"),
-    (("arms", 2, "interfaces"), [SIDE], "arms.2.interfaces", "> 0 [m] with an arm made of cells"),
+    (("arms", 2, "interfaces"), [SIDE], "arms.2.interfaces", "> 0 [m]: arms made of cells"),
     (("arms", 2, "interfaces"), [{**SIDE, "radius": 0.01}], "arms.2.interf", "nothing sits on it"),
 ]  # fmt: skip
 

@@ -23,7 +23,6 @@ DENSE = "design.initial=0.6"  # cut at one half, a uniform design of one half is
 # What a key needs to be used at all.
 USED = {
     "reduction.frequencies": ["reduction.method=krylov"],
-    "reduction.tolerance": ["reduction.coordinates=auto"],
     "motion.start": ["motion.path=line"],
     "motion.end": ["motion.path=line"],
     # With stiffening they are refused after a long search, as payload.mass is.
@@ -45,7 +44,7 @@ USED = {
     "arms.mesh_size": ["arms.mesh=meshes/arm_bores.geo", "arms.passive=0.001"],
 }
 # Loads and weights have tests of their own; the smallest tolerances run for minutes.
-NO_LIMITS = {"objective.loads", "scenarios.weight", "reduction.tolerance", "simulation.tolerance"}
+NO_LIMITS = {"objective.loads", "scenarios.weight", "simulation.tolerance"}
 
 
 MACHINE_KEYS = (

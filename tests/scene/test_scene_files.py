@@ -125,8 +125,8 @@ def test_an_own_mesh_has_the_size_of_cells_of_the_arm_before(tmp_path, file, tex
     ("suffix", "keys", "words"),
     [
         (".toml", {}, [".geo, .msh, .inp, .step, .stp"]),
-        (".msh", {"mesh_size": 0.01}, [".msh", "its cells"]),
-        (".msh", {"cell_shape": "triangle"}, [".msh", "its cells"]),
+        (".msh", {"mesh_size": 0.01}, [".msh", "says it itself"]),
+        (".msh", {"cell_shape": "triangle"}, [".msh", "says it itself"]),
         (".geo", {"mesh_size": 0.07}, ["at most height = 0.06 [m]"]),
         (".geo", {"cell_shape": "triangle", "element": "incompatible"},
          ['= "incompatible"', '"linear" or "quadratic"', "triangles"]),
@@ -166,7 +166,7 @@ REQUIRED = toml("[material]", MATERIAL) + toml("[[arms]]", ARM) + toml("[motion]
         ("payload.mass = 1e400" + REQUIRED, ["payload.mass = inf", "a finite number >= 0"]),
         ("payload.mass = nan" + REQUIRED, ["payload.mass = nan", "a finite number >= 0"]),
         ("payload.mass = 1979-05-27" + REQUIRED, ["payload.mass = 1979-05-27", "number >= 0"]),
-        ("[[material]]\ndensity = 1", ["material = [{density = 1}]", "a table with the keys"]),
+        ("[[material]]\ndensity = 1", ["material = [{ density = 1 }]", "a table with the keys"]),
         ("name = 'a'\n# L\udce4nge\n", ["line 2", "UTF-8"]),  # a byte of Latin-1
     ],
     ids=range(13),

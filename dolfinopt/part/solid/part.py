@@ -182,7 +182,6 @@ class SolidPart:
             "thickness": thickness,
             "cell_shape": "tetrahedron",
             "symmetric": False,
-            "extruded": False,
         }
 
     def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
@@ -219,7 +218,7 @@ def make_solid_part(domain: SolidDomain, curves: Curves = DEFAULTS) -> SolidPart
             raise InputError(
                 f"arm {domain.name!r}: its design varies over the thickness, so that its part has "
                 "no curves: leave out --tool-radius, --tolerance and --round, or optimise with "
-                "arms.extruded = true"
+                'arms.symmetric = "extruded"'
             )
         return _freeform_part(domain)
     return plate_part(domain, make_part(domain.flat, curves))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard
 
 from pydantic import AfterValidator, Field, PrivateAttr, model_validator
 from pydantic.fields import FieldInfo
@@ -18,7 +19,6 @@ from dolfinopt.scene.tables.base import (
     FileName,
     Inertia,
     Length,
-    Loc,
     Position,
     Refusal,
     Six,
@@ -102,19 +102,26 @@ MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error
 SECTIONS = ("box", "tube")
 SectionOrFile = Annotated[str, NAMES_FILE, Field(json_schema_extra={"examples": list(SECTIONS)})]
 WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
-WALL_KEYS = ("wall", "min_wall", "max_wall", "ribs")
-RIB_LENGTH, RIB_PITCH = 2, 4  # cells along a hollow arm: of a rib; from one to the next at least
+WALL_KEYS = ("wall", "min_wall", "max_wall")
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
 CellCount = Annotated[int, Field(ge=1, le=MAX_CELLS)]
 MAX_ARMS = 1000  # every arm is checked beside all others
 PART_FILES = ("_face", "_r12")  # behind an arm's name in files of its part
 STEP_FILES = (".step", ".stp")
-MESH_FILES = (".geo", ".msh", ".inp", *STEP_FILES)
+SID_FILES = (".sid", ".sid_fem")  # of this program and FEMBS, see `scene.sid`
+SIZE_KEYS = ("mesh_size", "cell_shape")
+# What files in place of cells say themselves.
+MESH_FILES: dict[str, tuple[str, ...]] = {
+    ".geo": (),
+    ".msh": SIZE_KEYS,
+    ".inp": SIZE_KEYS,
+    **dict.fromkeys(STEP_FILES, ("mesh_scale",)),
+    **dict.fromkeys(SID_FILES, (*SIZE_KEYS, "mesh_scale", "interface_offset")),
+}
 
 # What sits at an arm's ends; arms of one design may differ in it.
 JOINT_KEYS = ("joint_mass", "joint_inertia", *DRIVE_KEYS)
-SIZE_KEYS = ("mesh_size", "cell_shape")
 # What an arm is meshed from: one that states `cells` takes none of the others from the arm before.
 MESH_KEYS = ("cells", "mesh", *SIZE_KEYS, "interface_offset", "mesh_scale")
 # What an arm with a mesh of its own does not take.
@@ -124,10 +131,15 @@ CELLS_ACROSS = 12  # the height of an arm from a STEP file without mesh_size
 SOLID_CELLS_ACROSS = 4  # the smaller of height and thickness of a solid one
 # never taken from the arm before
 OWN_KEYS = (
-    "name", "design", "rigid", "mass", "inertia", "centre", "sid", "interfaces",
+    "name", "design", "rigid", "mass", "inertia", "centre", "interfaces",
 )  # fmt: skip
 # What an arm with another's design, scaled, has from there.
-PATTERN_KEYS = ("passive", "symmetric", "extruded", "regions")
+PATTERN_KEYS = ("passive", "symmetric", "regions")
+
+
+def is_sid(file: object) -> TypeGuard[str]:
+    """Return whether a file in place of cells holds a body as standard input data."""
+    return isinstance(file, str) and Path(file).suffix.lower() in SID_FILES
 
 
 def check_arm_name(name: str) -> str:
@@ -146,7 +158,7 @@ class Arm(Drive):
     """One flexible arm; a key left out in a scene is taken from the arm before."""
 
     USES = (
-        Use("wall min_wall max_wall ribs", "hollow"),
+        Use("wall min_wall max_wall", "hollow"),
         Use("mass inertia centre", "rigid"),
         Use("mesh_size cell_shape mesh_scale", "mesh"),
         *OF_PARTS,
@@ -169,8 +181,8 @@ class Arm(Drive):
     )
     mesh: FileName | None = setting(
         None,
-        "geometry or mesh file (.geo, .msh, .step, of Abaqus and CalculiX "
-        ".inp) in place of cells [-]",
+        "geometry or mesh file (.geo, .msh, .step, of Abaqus and CalculiX .inp) in place of cells; "
+        "or the whole body, not designed, as standard input data (.sid, .sid_fem) [-]",
     )
     mesh_size: Length | None = setting(
         None,
@@ -205,13 +217,11 @@ class Arm(Drive):
         "height, at most a tenth of the length; with a mesh file 0, its own groups "
         "[m]",
     )
-    symmetric: bool | Literal["z", "yz"] = setting(
+    symmetric: bool | Literal["z", "yz", "extruded", "y-extruded"] = setting(
         False,
         "keep the design symmetric about the arm's axis: true, about y = 0; of a solid "
-        'arm also "z", about z = 0, and "yz", about both [-]',
-    )
-    extruded: bool = setting(
-        False, "keep the design of a solid arm made of cells the same over the thickness [-]"
+        'arm also "z", about z = 0, and "yz", about both; of one made of cells "extruded", the '
+        'same over the thickness, and "y-extruded", about y = 0, too [-]',
     )
     hollow: bool | SectionOrFile = setting(
         False,
@@ -229,12 +239,6 @@ class Arm(Drive):
         None,
         "largest thickness of the wall, also that of the flanges, rings over passive "
         "at both ends; default: twice wall [m]",
-    )
-    ribs: int | None = setting(
-        None,
-        "rings of a hollow arm at even distances between its ends, two cells long and "
-        "as thick as max_wall; default: none [-]",
-        ge=0,
     )
     design: str | None = setting(
         None,
@@ -259,9 +263,6 @@ class Arm(Drive):
         0.0, "mass at the outboard interface: motor, gearbox, bearing [kg]"
     )
     joint_inertia: Inertia = setting(0.0, "moment of inertia at the outboard interface [kg m2]")
-    sid: FileName | None = setting(
-        None, "standard input data file (SID) in place of a geometry [-]"
-    )
     material: CatalogueName | None = setting(
         None,
         'name of this arm\'s material in the catalogue, e.g. "steel S355"; default: '
@@ -287,12 +288,12 @@ class Arm(Drive):
         self._check_mesh()
 
     def _check_kind(self) -> None:
-        stated = [key for key in ("design", "sid") if getattr(self, key) is not None]
-        if self.rigid:
-            stated.append("rigid")
+        kinds = {"design": self.design, "rigid": self.rigid, "mesh": self.sid}
+        stated = [key for key, value in kinds.items() if value]
         if len(stated) > 1:
             raise Refusal(
-                f"expected only one of design, rigid and sid, found {' and '.join(stated)}",
+                "expected only one of design, rigid and a body from a file, found "
+                f"{' and '.join(stated)}",
                 *stated,
             )
         if self.regions and not self.flexible:
@@ -303,21 +304,20 @@ class Arm(Drive):
             )
 
     def _check_thickness(self) -> None:
-        for key in ("symmetric", "extruded"):
-            if getattr(self, key) and not self.is_solid and (key, self.symmetric) != (key, True):
-                raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", key)
+        if isinstance(self.symmetric, str) and not self.is_solid:
+            raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", "symmetric")
         if self.extruded and self.cells is None:
-            raise Refusal("expected only with cells = [nx, ny, nz]", "extruded", "mesh")
+            raise Refusal("expected only with cells = [nx, ny, nz]", "symmetric", "mesh")
         for number, region in enumerate(self.regions):
             key = f"regions.{number}.depth"
             if region.depth is not None and not self.is_solid:
                 raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", key)
             if region.depth is not None and self.extruded:
                 raise Refusal(
-                    "expected none with extruded = true: the design is the same through the "
-                    "thickness",
+                    f'expected none with symmetric = "{self.symmetric}": the design is the same '
+                    "through the thickness",
                     key,
-                    "extruded",
+                    "symmetric",
                 )
 
     def _check_hollow(self) -> None:
@@ -336,7 +336,9 @@ class Arm(Drive):
                 "wall",
                 "hollow",
             )
-        for key in ("extruded", "regions", "interfaces"):
+        if self.extruded:
+            raise Refusal("expected another value with hollow = true", "symmetric", "hollow")
+        for key in ("regions", "interfaces"):
             self.refuse_stated(key, "with hollow = true", "hollow")
         if self.element not in (None, "incompatible"):
             raise Refusal(
@@ -348,13 +350,6 @@ class Arm(Drive):
             raise Refusal(
                 f"expected at most {MOST_AROUND} cells round the section with hollow = true, "
                 f"2 (ny + nz), found {around}",
-                "cells",
-            )
-        if self.ribs and RIB_PITCH * (self.ribs + 1) > self.cells[0]:
-            raise Refusal(
-                f"expected at most {max(0, self.cells[0] // RIB_PITCH - 1)} with "
-                f"{self.cells[0]} cells along the arm, {RIB_PITCH} from rib to rib",
-                "ribs",
                 "cells",
             )
         self._check_wall()
@@ -456,6 +451,11 @@ class Arm(Drive):
         """Whether the arm is meshed and reduced here, alone or with the arm it shares with."""
         return not self.rigid and self.sid is None
 
+    @property
+    def sid(self) -> str | None:
+        """Standard input data that the arm's body is read from; None of others."""
+        return self.mesh if is_sid(self.mesh) else None
+
     def _check_ends(self) -> None:
         if self.length < SHORTEST and not (self.rigid and self.length == 0.0):
             raise Refusal(f"expected a number >= {SHORTEST:g} and <= 10000 [m]", "length")
@@ -482,8 +482,6 @@ class Arm(Drive):
             if self.hull is None:
                 self.refuse_stated("interface_offset", "without mesh: an arm of cells has no file")
             return
-        if self.mesh_scale != 1.0 and Path(self.mesh).suffix.lower() in STEP_FILES:
-            raise Refusal("expected none: a STEP file states its unit", "mesh_scale", "mesh")
         if self.interface_offset is not None and not self.is_solid:
             raise Refusal("expected only with the mesh of a solid arm", "interface_offset")
         if self.cells is not None:
@@ -501,14 +499,9 @@ class Arm(Drive):
         kind = Path(self.mesh).suffix.lower()
         if kind not in MESH_FILES:
             raise Refusal(f"expected a file that ends in {', '.join(MESH_FILES)}", "mesh")
-        for key in SIZE_KEYS:
-            told = key == "cell_shape" and self.cell_shape in SOLID_SHAPES
-            if kind in (".msh", ".inp") and getattr(self, key) is not None and not told:
-                raise Refusal(
-                    f"expected only with .geo or .step: a {kind} file has its cells",
-                    key,
-                    "mesh",
-                )
+        for key in MESH_FILES[kind]:
+            if key != "cell_shape" or not self.is_solid or self.sid:
+                self.refuse_stated(key, f"with a {kind} file, which says it itself", "mesh")
         if kind == ".inp" and not self.is_solid:
             raise Refusal(
                 'expected "tetrahedron" or "hexahedron" with a .inp file, whose cells are solid',
@@ -529,7 +522,12 @@ class Arm(Drive):
     @property
     def symmetric_about(self) -> tuple[bool, bool]:
         """Whether the design is symmetric about y = 0 and about z = 0."""
-        return self.symmetric in (True, "yz"), self.symmetric in ("z", "yz")
+        return self.symmetric in (True, "yz", "y-extruded"), self.symmetric in ("z", "yz")
+
+    @property
+    def extruded(self) -> bool:
+        """Whether the design is the same over the thickness."""
+        return self.symmetric in ("extruded", "y-extruded")
 
     @property
     def depth(self) -> float:
@@ -601,7 +599,7 @@ class Arm(Drive):
         """Return the share of the arm's volume that stays solid, in [0, 1]; 0 for a mesh file."""
         if self.cells is None:
             return 0.0
-        return (2.0 * self.passive_columns + RIB_LENGTH * (self.ribs or 0)) / self.cells[0]
+        return 2.0 * self.passive_columns / self.cells[0]
 
     @property
     def fixed_shares(self) -> tuple[float, float]:
@@ -661,9 +659,10 @@ class Arm(Drive):
             in_frame(self, interface.point) for interface in self.further_interfaces
         )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse files of one name, and what does not fit the arm whose design it has."""
-        before = scene.arms[: at[-1]]
+        index = scene.places[self.name]
+        before = scene.arms[:index]
         if not scene.is_spatial:
             self._check_files(before)
             self.check_plane_bearing()
@@ -674,23 +673,21 @@ class Arm(Drive):
                 ".cells" if self.cells is not None else ".cell_shape",
             )
         if self.flexible:
-            self._check_material(scene, at[-1])
+            self._check_material(scene, index)
         self._check_inertia(scene)
-        check_interfaces(scene, at[-1])
-        check_motor(scene, at[-1])
+        check_interfaces(scene, index)
+        check_motor(scene, index)
         check_regions(self)
-        if self.pattern is not None:
-            self._check_pattern(before)
-        elif self.design is not None and self.design not in {a.name for a in before if a.own}:
-            self._refuse_design([arm.name for arm in before if arm.own])
+        if self.design is not None:
+            self._check_design(before)
 
     def _check_material(self, scene: Scene, index: int) -> None:
         """Refuse an own material, or the scene's, that this arm cannot be made of."""
         solid = scene.material_of(index)
-        if self.hollow and solid.angle_axis is not None:
+        if self.hollow and isinstance(solid.angle, tuple):
             raise Refusal(
-                "expected none with hollow = true: the angle turns about the wall's normal",
-                ".angle_axis",
+                "expected a number with hollow = true: the angle turns about the wall's normal",
+                ".angle" if vars(self)["angle"] is not None else "material.angle",
                 ".hollow",
             )
         try:
@@ -723,58 +720,35 @@ class Arm(Drive):
             reason = "expected more than 0 without [[joints]]: the machine moves in the plane"
             raise Refusal(reason, ".length")
 
-    def _refuse_design(self, names: list[str], hint: str = "") -> None:
-        allowed = " | ".join(map(shown, names)) or "no arm before it has one"
-        raise Refusal(
-            f"expected the name of an earlier arm with a design of its own: {allowed}{hint}",
-            ".design",
-        )
-
-    def _check_pattern(self, before: tuple[Arm, ...]) -> None:
-        """Refuse a pattern that is none, or whose cells are not this arm's one by one."""
-        designed = {arm.name: arm for arm in before if arm.designed}
-        if self.pattern not in designed:
-            others = {arm.name: arm.design for arm in before}
-            origin = others.get(str(self.pattern))
-            hint = f"; {self.pattern} itself has that of {origin}" if origin else ""
-            self._refuse_design(list(designed), hint)
-        assert self.pattern is not None
-        pattern = designed[self.pattern]
-        if pattern.interfaces:
+    def _check_design(self, before: tuple[Arm, ...]) -> None:
+        """Refuse a design of no arm before it, or whose cells are not this arm's one by one."""
+        owners = {arm.name: arm for arm in before if (arm.designed if self.pattern else arm.own)}
+        if (owner := owners.get(str(self.design))) is None:
+            origin = next((arm.design for arm in before if arm.name == self.design), None)
+            hint = f"; {self.design} itself has that of {origin}" if origin else ""
+            allowed = " | ".join(map(shown, owners)) or "no arm before it has one"
             raise Refusal(
-                f"expected an arm without interfaces: {self.pattern} has some, around which cells "
-                "stay solid",
+                f"expected the name of an earlier arm with a design of its own: {allowed}{hint}",
                 ".design",
             )
-        if self.hollow or pattern.hollow:
-            raise Refusal(
-                f"expected that of {self.pattern}, whose design it has: walls are not scaled",
-                f".{self.differences(pattern)[0]}",
-                ".design",
-            )
-        for item, name in ((pattern, self.pattern), (self, self.name)):
-            if item.mesh is not None:
+        if self.pattern is None:
+            return
+        for arm, key in product((owner, self), ("mesh", "hollow", "interfaces")):
+            if getattr(arm, key):
+                same = ", ".join(self.differences(owner))
                 raise Refusal(
-                    f"expected an arm with cells, or the same "
-                    f"{', '.join(self.differences(pattern))} as it has: {name} has mesh = "
-                    f"{shown(item.mesh)}, whose cells have no "
-                    "partners in another mesh",
+                    f"expected the same {same} as {owner.name} has: {arm.name} has {key}, and only "
+                    "arms of cells, without further interfaces, are scaled",
                     ".design",
-                    ".mesh",
+                    f".{key}",
                 )
-        if self.cells != pattern.cells:
-            raise Refusal(
-                f"expected {shown(pattern.cells)} as {self.pattern} has, whose design it repeats "
-                "cell by cell",
-                ".cells",
-                ".design",
-            )
-        for key in PATTERN_KEYS:
-            stated, theirs = getattr(self, key), getattr(pattern, key)
-            if stated not in (Arm.model_fields[key].default, theirs):
+        for key in ("cells", *PATTERN_KEYS):
+            theirs = getattr(owner, key)
+            if getattr(self, key) not in (theirs, Arm.model_fields[key].default):
+                words = shown(theirs) if key == "cells" else "that"
                 raise Refusal(
-                    f"expected none: it is that of {self.pattern}, scaled, whose design this arm "
-                    "repeats",
+                    f"expected none, or {words} as {owner.name} has, whose design this arm "
+                    "repeats, scaled",
                     f".{key}",
                     ".design",
                 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Mapping, Sequence
 from types import UnionType
@@ -55,6 +56,7 @@ Three = tuple[T, T, T]
 Six = tuple[T, T, T, T, T, T]
 TwoOrThree = tuple[T, T] | tuple[T, T, T]  # in the plane or in space
 MAX_ITERATIONS = 1_000_000
+DEEPEST = 100  # of arrays and tables in each other
 
 NAMES_FILE = "names a file"
 FileName = Annotated[str, NAMES_FILE]  # path of a file; a scene holds it absolute
@@ -182,8 +184,8 @@ class Table(BaseModel):
         object.__setattr__(checked, "__pydantic_private__", copy.__pydantic_private__)
         return checked
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
-        """Check what this table at `at` and other tables of `scene` must agree on.
+    def check_in_scene(self, scene: Scene) -> None:
+        """Check what this table and others of `scene` must agree on.
 
         Raises:
             Refusal: they do not.
@@ -198,7 +200,7 @@ class Table(BaseModel):
         try:
             self._check_name(scene, at)
             self._check_dimension(scene)
-            self.check_in_scene(scene, at)
+            self.check_in_scene(scene)
         except Refusal as refusal:
             raise refusal.below(at) from None
 
@@ -316,26 +318,37 @@ def key_text(part: Any) -> str:
 
 def shown(value: Any) -> str:
     """Return `value` in TOML's spelling, cut to a length that fits a message."""
-    return cut(_spelled(value, 3))
+    return cut(toml_value(value, 3))
 
 
 def cut(text: str) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _spelled(value: Any, depth: int) -> str:
-    if isinstance(value, (bool, str)):
-        return json.dumps(value, ensure_ascii=False)
+def toml_value(value: Any, depth: int = DEEPEST) -> str:
+    """Return a value as TOML: numbers, also NumPy's, texts, paths, arrays and tables.
+
+    Entries that are None are left out, and what is nested deeper than `depth`.
+    """
+    if hasattr(value, "tolist"):  # NumPy's
+        value = value.tolist()
+    if isinstance(value, (bool, str, os.PathLike)):
+        text = os.fspath(value) if isinstance(value, os.PathLike) else value
+        return json.dumps(text, ensure_ascii=False)
     if isinstance(value, int) and value.bit_length() > 256:  # Python refuses to print huge ones
         return f"{'-' if value < 0 else ''}2**{value.bit_length() - 1}..."
-    if isinstance(value, (Mapping, list, tuple)) and depth == 0:
+    if not isinstance(value, (Mapping, list, tuple)):
+        return str(value)
+    if depth == 0:
         return "..."
     if isinstance(value, Mapping):
-        items = [f"{key_text(key)} = {_spelled(item, depth - 1)}" for key, item in value.items()]
-        return f"{{{', '.join(items)}}}"
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(_spelled(item, depth - 1) for item in value)}]"
-    return str(value)
+        pairs = [
+            f"{key_text(key)} = {toml_value(item, depth - 1)}"
+            for key, item in value.items()
+            if item is not None
+        ]
+        return f"{{ {', '.join(pairs)} }}"
+    return f"[{', '.join(toml_value(item, depth - 1) for item in value if item is not None)}]"
 
 
 def input_error(where: str, text: str) -> InputError:

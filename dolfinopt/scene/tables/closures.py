@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, field_validator
 
@@ -12,7 +11,6 @@ from dolfinopt.scene.tables.base import (
     Angle,
     Component,
     Length,
-    Loc,
     Position,
     Refusal,
     Stiffness,
@@ -20,8 +18,6 @@ from dolfinopt.scene.tables.base import (
     Three,
     TwoOrThree,
     Use,
-    input_error,
-    rows,
     setting,
 )
 from dolfinopt.scene.tables.joints import (
@@ -41,18 +37,17 @@ Line = tuple[Component, Component]
 Kind = Literal["ball", "pin", "slider", "universal", "rod"]
 # Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
 OF_THE_END = ("deviation", "settling")
-# What is positive of every equation's force, in the joint's frame, and its unit; in the plane and
-# in space.
-Parts = tuple[tuple[str, str], ...]
-IN_PLANE: dict[str, Parts] = {"pin": (("x", "N"), ("y", "N")), "slider": (("normal", "N"),)}
-IN_SPACE: dict[str, Parts] = {
-    "ball": (("x", "N"), ("y", "N"), ("z", "N")),
-    "pin": (("x", "N"), ("y", "N"), ("z", "N"), ("moment_1", "N m"), ("moment_2", "N m")),
-    "slider": (("force_1", "N"), ("force_2", "N"), ("moment_1", "N m"), ("moment_2", "N m"),
-               ("moment_3", "N m")),
-    "universal": (("x", "N"), ("y", "N"), ("z", "N"), ("moment", "N m")),
-    "rod": (("", "N"),),
-}  # fmt: skip
+# What is positive of every equation's force and moment, in the joint's frame; in the plane and in
+# space.
+Names = tuple[str, ...]
+IN_PLANE: dict[str, tuple[Names, Names]] = {"pin": (("x", "y"), ()), "slider": (("normal",), ())}
+IN_SPACE: dict[str, tuple[Names, Names]] = {
+    "ball": (("x", "y", "z"), ()),
+    "pin": (("x", "y", "z"), ("moment_1", "moment_2")),
+    "slider": (("force_1", "force_2"), ("moment_1", "moment_2", "moment_3")),
+    "universal": (("x", "y", "z"), ("moment",)),
+    "rod": (("",), ()),
+}
 
 
 class Closures(Table):
@@ -111,14 +106,10 @@ class Closures(Table):
         """Whether it is a rod that gives way."""
         return self.stiffness > 0.0
 
-    @property
-    def has_coordinate(self) -> bool:
-        """Whether the length of a rod changes: it is a rigid coordinate of the machine."""
-        return self.driven or self.is_spring
-
-    def parts(self, dimension: int) -> Parts:
+    def parts(self, dimension: int) -> tuple[tuple[str, str], ...]:
         """Return what is positive of every equation's force, in the joint's frame, and its unit."""
-        return (IN_SPACE if dimension == 3 else IN_PLANE)[self.kind]
+        forces, moments = (IN_SPACE if dimension == 3 else IN_PLANE)[self.kind]
+        return *((name, "N") for name in forces), *((name, "N m") for name in moments)
 
     @field_validator("axis")
     @classmethod
@@ -140,7 +131,7 @@ class Closures(Table):
         if abs(along) > 1e-6 * math.hypot(*self.axis) * math.hypot(*self.cross_axis):
             raise Refusal("expected a direction across closures.axis", "cross_axis", "axis")
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
         if self.name.casefold() in [joint.name.casefold() for joint in scene.joints]:
             raise Refusal("expected a name that no joint or other closure has", ".name")
@@ -236,7 +227,7 @@ class Closures(Table):
     def _check_pin(self, scene: Scene) -> None:
         """Refuse responses of the deviation of an end that a pin holds, and forces along a line."""
         for n, force in enumerate(scene.forces):
-            if force.name == OLD:
+            if force.name == "closure":
                 reason = "expected 0.0, the default, with a pin: its end does not move"
                 raise Refusal(reason, f"forces.{n}.factor", ".kind")
         for key in set(OF_THE_END).intersection(response.name for response in asked(scene)):
@@ -253,86 +244,3 @@ class Closures(Table):
         check_site(scene, self.between[1], ".between", (GROUND,))
         if site_of(self.between[0])[0] == site_of(self.between[1])[0]:
             raise Refusal("expected interfaces of two arms", ".between")
-
-
-# -- `[closure]`, an older word -------------------------------------------------------------------
-#
-# The tree is the scene as read, before it is validated: values of any type may stand in it.
-
-OLD = "closure"  # the table, and the name of what it states among [[closures]] and [[forces]]
-
-
-OLD_CLOSURE = (
-    "[closure] is read as one of [[closures]], closure.direction as its axis, closure.force as the "
-    'factor of the force "closure" among [[forces]]; state those'
-)
-
-
-def read_old_closure(tree: dict[str, Any], source: str) -> None:
-    """Put [closure] of a scene in its places.
-
-    Raises:
-        InputError: it is no table, or stands beside [[closures]] or [[joints]].
-    """
-    if (table := tree.pop(OLD, None)) is not None:
-        others = tree.get("closures") or tree.get("joints")
-        take_old_keys(tree, None if others else table, source)
-
-
-def take_old_keys(tree: dict[str, Any], table: Any, source: str) -> None:
-    """Put keys of [closure] in their places: of [[closures]], and `force` of [[forces]].
-
-    Raises:
-        InputError: it is no table.
-    """
-    if not isinstance(table, dict):
-        raise input_error(source, "closure: expected [[closures]], of which it is an older word")
-    tree[OLD] = True  # messages name its keys
-    last = [arm.get("name") for arm in rows(tree, "arms")][-1:]
-    tree["closures"] = tree.get("closures") or [{"name": OLD, "between": [*last, GROUND]}]
-    for row in rows(tree, "closures")[:1]:
-        before = _unit(row.get("axis"))
-        row.update({"axis" if key == "direction" else key: x for key, x in table.items()})
-        load = row.pop("force", None)
-        if row.get("kind") == "slider":
-            row.setdefault("axis", [1.0, 0.0])
-        elif row.get("axis") == [1.0, 0.0]:
-            del row["axis"]  # the default of a line
-        if load and not _old_forces(tree):
-            tree["forces"] = [*(tree.get("forces") or []), {"name": OLD, "arm": last[0]}]
-        for force in _old_forces(tree):
-            if load is not None:
-                force["factor"] = load
-            if load is not None or force.get("force") == before:
-                force["force"] = _unit(row.get("axis"))
-
-
-def _old_forces(tree: Mapping[str, Any]) -> list[dict[str, Any]]:
-    return [force for force in rows(tree, "forces") if force.get("name") == OLD]
-
-
-def _unit(axis: Any) -> list[float]:
-    """Return an axis of the plane of length 1; along x where it is none, which is refused."""
-    try:
-        size = math.hypot(*axis[:2])
-        return [x / size for x in axis[:2]]
-    except (TypeError, ZeroDivisionError):
-        return [1.0, 0.0]
-
-
-def as_written(loc: Loc, tree: Mapping[str, Any]) -> Loc:
-    """Return the path of a key as [closure] has it, where the scene states that."""
-    if OLD in tree and len(loc) > 2 and loc[0] == "closures":
-        return (OLD, *("direction" if part == "axis" else part for part in loc[2:]))
-    if OLD in tree and len(loc) > 2 and loc[0] == "forces":
-        return (OLD, "force") if tree["forces"][loc[1]].get("name") == OLD else loc
-    return loc
-
-
-def in_new_words(key: str) -> str:
-    """Return a dotted key of [closure] as a scene has it, any other as it is."""
-    table, _, rest = key.partition(".")
-    if table != OLD:
-        return key
-    known = {"force": f"forces.{OLD}.factor", "direction": "closures.0.axis"}
-    return known.get(rest, f"closures.0.{rest}")

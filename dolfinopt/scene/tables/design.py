@@ -12,7 +12,6 @@ from dolfinopt.scene.tables.base import (
     MAX_ITERATIONS,
     Extent,
     Length,
-    Loc,
     Position,
     Refusal,
     Table,
@@ -196,20 +195,12 @@ class Design(Table):
                 "volume_fraction",
             )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what the arms, their cells and their solid ends cannot meet."""
         if not scene.cell_counts:  # nothing to design
             return
         self._check_hollow(scene)
         self._check_member_width(scene)
-        longest = max(arm.length for arm in scene.arms)
-        if self.filter_radius > longest:
-            raise Refusal(
-                f"expected at most the length of the longest arm, {longest} [m]: a wider filter "
-                "leaves one density for a whole arm",
-                "design.filter_radius",
-                *(f"arms.{i}.length" for i in range(len(scene.arms))),
-            )
         self._check_volume(scene)
 
     def _check_hollow(self, scene: Scene) -> None:
@@ -363,15 +354,13 @@ class Region(Table):
 
 
 def check_regions(arm: Arm) -> None:
-    """Refuse a region outside a rectangular arm; other things the mesh must tell.
+    """Refuse regions that a rectangular arm cannot have; of others the mesh tells.
 
     Raises:
         Refusal: its keys are the arm's own.
     """
     if not arm.regions or arm.cells is None:
         return
-    for number, region in enumerate(arm.regions):
-        _check_place(region, arm, f".regions.{number}")
     from dolfinopt.scene.regions import MOST_CELLS, grid_regions  # NumPy
 
     problem = grid_regions(arm)[1] if arm.n_cells <= MOST_CELLS else None
@@ -379,26 +368,6 @@ def check_regions(arm: Arm) -> None:
         number, reason = problem
         shape = arm.regions[number].shape
         raise Refusal(reason, f".regions.{number}.{shape}", ".passive", ".cells")
-
-
-def _check_place(region: Region, arm: Arm, at: str) -> None:
-    """Refuse a region beside a box, or above or below it."""
-    x0, y0, x1, y1 = region.bounds
-    half, deep = 0.5 * arm.height, 0.5 * arm.thickness
-    if x0 >= arm.length or x1 <= 0.0 or y0 >= half or y1 <= -half:
-        raise Refusal(
-            f"expected a place in the arm, x from 0 to {arm.length} and y from {-half:g} "
-            f"to {half:g} [m]",
-            f"{at}.{region.shape}",
-            ".length",
-            ".height",
-        )
-    if region.depth is not None and (region.depth[0] >= deep or region.depth[1] <= -deep):
-        raise Refusal(
-            f"expected a place in the arm, z from {-deep:g} to {deep:g} [m]",
-            f"{at}.depth",
-            ".thickness",
-        )
 
 
 # -- `[interpolation]` ---------------------------------------------------------------------------

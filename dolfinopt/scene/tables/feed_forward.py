@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from dolfinopt.scene.tables.base import Duration, Instant, Loc, Refusal, Table, Use, setting, shown
+from dolfinopt.scene.tables.base import Duration, Instant, Refusal, Table, Use, setting, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -41,7 +41,7 @@ class FeedForward(Table):
         """Whether joints are corrected."""
         return self.kind != "none"
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what nothing uses, joints that are no drives, and motions without a free tip."""
         if not self.on:
             return

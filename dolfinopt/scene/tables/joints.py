@@ -123,10 +123,6 @@ def check_interfaces(scene: Scene, index: int) -> None:
     arm = scene.arms[index]
     if not arm.interfaces:
         return
-    if arm.pattern is not None:
-        raise Refusal(
-            "expected none with the design of another arm, scaled", ".interfaces", ".design"
-        )
     celled = arm.flexible and arm.cells is not None
     known = [interface.name.casefold() for interface in arm.interfaces]
     for k, interface in enumerate(arm.interfaces):
@@ -136,15 +132,12 @@ def check_interfaces(scene: Scene, index: int) -> None:
         if interface.axis is not None and (arm.mesh is None or not arm.flexible):
             raise Refusal("expected only with a mesh file, whose bore it is", f"{here}.axis")
         if (interface.radius is None) == (celled or interface.axis is not None):
-            owner = "a rigid arm" if arm.rigid else "an arm made of cells"
-            if arm.sid is not None:
-                owner = f'a body from a file, which has a node "{interface.name}"'
-            elif not arm.rigid and arm.cells is None:
-                owner = f'a mesh file, which has faces in a group "{interface.name}"'
-            if interface.axis is not None:
-                owner = "the axis of a bore"
             expected = "a number > 0 [m]" if interface.radius is None else "none"
-            raise Refusal(f"expected {expected} with {owner}", f"{here}.radius")
+            raise Refusal(
+                f"expected {expected}: arms made of cells, and bores (axis), have one; other files "
+                f'have faces, or a node, of the name "{interface.name}"',
+                f"{here}.radius",
+            )
 
 
 def check_used(scene: Scene) -> None:
@@ -179,7 +172,7 @@ def check_bores(arm: Arm) -> None:
     Raises:
         Refusal: its keys are paths from the arm.
     """
-    ends = {interface.name.strip().casefold(): k for k, interface in enumerate(arm.interfaces)}
+    ends = {interface.is_end: k for k, interface in enumerate(arm.interfaces)}
     bores = [ends[name] for name in (INBOARD, OUTBOARD) if name in ends]
     for k in bores:
         at = f"interfaces.{k}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field
@@ -14,7 +15,6 @@ from dolfinopt.scene.tables.base import (
     DriveForce,
     FileName,
     Inertia,
-    Loc,
     Position,
     Refusal,
     Stiffness,
@@ -63,7 +63,7 @@ class Joint(Drive):
     USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"), *OF_PARTS)
 
     name: Annotated[str, AfterValidator(check_joint_name)] = setting(
-        "unique name, the column of its coordinate in tables [-]"
+        "unique name, the column of its coordinate in tables, of a rod without length of that [-]"
     )
     type: JointType = setting("what moves: an angle, a distance, or nothing [-]")
     parent: str = setting(
@@ -123,13 +123,13 @@ class Joint(Drive):
                 f"expected an array of three numbers with a {self.type} joint", "axis", "type"
             )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse names that are unknown; with the last joint, all that joints rule out.
 
         Raises:
             Refusal: its keys are paths from the scene.
         """
-        before = scene.joints[: at[-1]]
+        before = list(takewhile(lambda joint: joint is not self, scene.joints))
         names = [arm.name for arm in scene.arms]
         if self.child not in names:
             allowed = " | ".join(map(shown, names))
@@ -243,7 +243,7 @@ class Control(Table):
         "names; zero behind its last row [N, N m]",
     )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse gains and limits that are not one for every driven coordinate."""
         if self.feed_forward == "elastic" and not any(
             part.stiffness for part in joint_parts(scene)
@@ -296,7 +296,7 @@ class Payload(Table):
         """Inertia of inertia in the plane, about z, kg m2."""
         return self.inertia[2] if isinstance(self.inertia, tuple) else self.inertia
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse a tensor that no body has, and a place that no arm has."""
         if problem := tensor_problem(self.inertia):
             raise Refusal(problem, ".inertia")
@@ -363,7 +363,7 @@ class Force(Table):
             return (0.0,) * (1 if dimension == 2 else 3)
         return self.moment if isinstance(self.moment, tuple) else (self.moment,)
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what acts nowhere, or a key that nothing uses."""
         check_site(scene, self.arm, ".arm")
         if scene.is_spatial and isinstance(self.moment, float):

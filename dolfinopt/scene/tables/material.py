@@ -12,7 +12,6 @@ from pydantic import AfterValidator, Field, WithJsonSchema
 
 from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.tables.base import (
-    Component,
     Refusal,
     Table,
     Three,
@@ -33,7 +32,6 @@ Quantity = Annotated[float, Field(ge=-1e15, le=1e15)]  # a key of a law of one's
 YoungModuli = YoungModulus | TwoOrThree[YoungModulus]
 ShearModuli = YoungModulus | Three[YoungModulus]
 PoissonRatios = PoissonRatio | AnyRatio | Three[AnyRatio]
-Axis = Three[Component]
 
 
 def check_material(name: str) -> str:
@@ -46,7 +44,9 @@ def check_material(name: str) -> str:
 CatalogueName = Annotated[
     str,
     AfterValidator(check_material),
-    WithJsonSchema({"type": "string", "enum": list(CATALOGUE)}),
+    WithJsonSchema(
+        {"enum": list(CATALOGUE), "description": "the name of a material of the catalogue"}
+    ),
 ]
 
 
@@ -57,7 +57,7 @@ class LawDeclaration:
     Attributes:
         kind: the word of material.kind.
         keys: of [material] that it needs beside young_modulus, poisson_ratio and density.
-        directed: whether it has directions, which `angle` and `angle_axis` turn.
+        directed: whether it has directions, which `angle` turns.
         has_strength: whether von Mises's stress tells when it yields.
         scales: whether all of its stiffness is proportional to young_modulus alone.
     """
@@ -71,7 +71,7 @@ class LawDeclaration:
     @property
     def used(self) -> tuple[str, ...]:
         """Keys that not every kind has and this one has."""
-        directions = ("angle", "angle_axis") if self.directed else ()
+        directions = ("angle",) if self.directed else ()
         return self.keys + directions + (("yield_strength",) if self.has_strength else ())
 
 
@@ -116,15 +116,11 @@ class Material(Table):
         "shear modulus of an orthotropic material: G12, in space of all three planes, "
         "or [G12, G23, G13] [Pa]",
     )
-    angle: FibreAngle | None = setting(
+    angle: FibreAngle | Three[FibreAngle] | None = setting(
         None,
         "angle of direction 1 from the arm's axis, from x towards y, in the wall of a "
-        "hollow arm as seen from outside; default: 0 [rad]",
-    )
-    angle_axis: Axis | None = setting(
-        None,
-        "axis about which angle turns, in the frame of a solid arm; default: "
-        "[0, 0, 1], of a hollow arm its wall's normal [-]",
+        "hollow arm as seen from outside; of a solid arm also roll, pitch and yaw of the "
+        "directions, as of [[joints]]; default: 0 [rad]",
     )
     density: MassDensity = setting("mass density of the solid material [kg/m3]")
     yield_strength: YieldStrength | None = setting(
@@ -189,7 +185,12 @@ def check_orthotropic(solid: Material, dim: int | None) -> None:
     young, ratio = solid.young_modulus, solid.poisson_ratio
     if not isinstance(young, tuple):
         raise Refusal('expected [E1, E2] with kind = "orthotropic"', "young_modulus", "kind")
-    for key, most in (("young_modulus", 2), ("poisson_ratio", 1), ("shear_modulus", 1)):
+    for key, most in (
+        ("young_modulus", 2),
+        ("poisson_ratio", 1),
+        ("shear_modulus", 1),
+        ("angle", 1),
+    ):
         value = getattr(solid, key)
         if dim == 2 and isinstance(value, tuple) and len(value) > most:
             raise Refusal(f"expected {most} of an arm in plane stress, not 3", key)
@@ -212,5 +213,3 @@ def check_orthotropic(solid: Material, dim: int | None) -> None:
             "poisson_ratio",
             "young_modulus",
         )
-    if solid.angle_axis is not None and not any(solid.angle_axis):
-        raise Refusal("expected a direction, not three zeros", "angle_axis")

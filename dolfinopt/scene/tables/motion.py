@@ -16,7 +16,6 @@ from dolfinopt.scene.tables.base import (
     Inertia,
     Instant,
     Length,
-    Loc,
     Position,
     Refusal,
     Table,
@@ -269,7 +268,7 @@ class Motion(Table):
                 *(("motion", key) for key in limits),
             )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
         if self.table_ends == "moving" and self.horizon > self.duration:
             raise Refusal(
@@ -376,47 +375,36 @@ class Simulation(Table):
         le=1e5,
     )
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse an interval longer than the horizon, or too short for the memory."""
         horizon = scene.motion.horizon
-        if not 1.0 <= self.num_samples(horizon) <= MAX_SAMPLES:
+        if not 1.0 <= horizon / self.sample * (1.0 + 1e-9) <= MAX_SAMPLES:
             raise Refusal(
                 f"expected between {horizon / MAX_SAMPLES} and motion.horizon = {horizon} [s]",
                 "simulation.sample",
                 "motion.horizon",
             )
 
-    def num_samples(self, horizon: float) -> float:
-        """Return how many intervals of the output a `horizon`, s, has; 3 s of 1 ms are 3000."""
-        return horizon / self.sample * (1.0 + 1e-9)
-
 
 # -- `[reduction]` -------------------------------------------------------------------------------
 
 SHIFTS, BAND = (0.0,), (0.0, 50.0)  # Hz; defaults
 ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
-Coordinates = Annotated[int, Field(ge=1)] | Literal["auto"]
+ReductionError = Annotated[float, Field(ge=1e-6, le=0.5)]
+Coordinates = Annotated[int, Field(ge=1)] | ReductionError | Literal["auto"]
 
 
 class Reduction(Table):
     """Model reduction of every arm."""
 
-    USES = (
-        Use("frequencies", "method", "krylov balanced"),
-        Use("tolerance", "coordinates", "auto"),
-    )
+    USES = (Use("frequencies", "method", "krylov balanced"),)
 
     method: ReductionMethod = setting("craig-bampton", "method of model reduction [-]")
     coordinates: Coordinates = setting(
         4,
-        'number of elastic coordinates q of each arm; "auto": the smallest number '
-        "that meets reduction.tolerance; default in space: 6 for each outboard interface [-]",
-    )
-    tolerance: float = setting(
-        1e-3,
-        'with "auto": allowed relative error of the reduction, energy norm [-]',
-        ge=1e-6,
-        le=0.5,
+        "number of elastic coordinates q of each arm; or the relative error of the reduction, "
+        'energy norm, which the smallest number meets, "auto" being 0.001; default in space: 6 for '
+        "each outboard interface [-]",
     )
     frequencies: tuple[Frequency, ...] | None = setting(
         None,
@@ -446,7 +434,7 @@ class Reduction(Table):
     def check_table(self) -> None:
         """Refuse frequencies and numbers of coordinates that the method cannot have."""
         self._check_frequencies()
-        if self.coordinates == "auto" or self.count >= self.fewest:
+        if not self.count or self.count >= self.fewest:
             return
         if self.method == "craig-bampton":
             raise Refusal(
@@ -465,8 +453,13 @@ class Reduction(Table):
 
     @property
     def count(self) -> int:
-        """The stated number of coordinates; 0 with "auto"."""
-        return 0 if self.coordinates == "auto" else self.coordinates
+        """The stated number of coordinates; 0 where it follows from an error."""
+        return self.coordinates if isinstance(self.coordinates, int) else 0
+
+    @property
+    def tolerance(self) -> float:
+        """The relative error that the smallest number of coordinates is to meet."""
+        return self.coordinates if isinstance(self.coordinates, float) else 1e-3
 
     @property
     def fewest(self) -> int:
@@ -479,7 +472,7 @@ class Reduction(Table):
             return self.fewest
         return self.fewest // 3 * arm.num_outboard
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse more coordinates than an arm has dofs, and undamped resonances in a Gramian."""
         for i, arm in enumerate(scene.arms):
             least = self.fewest_of(arm)

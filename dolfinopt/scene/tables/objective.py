@@ -13,7 +13,6 @@ from dolfinopt.scene.tables.base import (
     ByDimension,
     Extent,
     Instant,
-    Loc,
     Refusal,
     Six,
     Table,
@@ -27,7 +26,6 @@ from dolfinopt.scene.tables.responses import (
     LARGEST_LOAD,
     Declaration,
     Direction,
-    Frequency,
     Need,
     StiffnessCase,
     asked,
@@ -49,7 +47,6 @@ else:  # the words of the responses that are declared
 GradientKind = Literal["esl", "exact"]
 Attached = Literal["rigid-body", "point-mass", "none"]
 Combination = Literal["sum", "worst"]
-WorstBy = Literal["compliance", "deviation"]
 MANY_CASES = 1000  # load cases that a motion may have however short it is
 Load = Three[float]  # F_x N, F_y N, moment N m
 SpatialLoad = Six[float]  # force N, moment N m
@@ -84,9 +81,6 @@ class Objective(Table):
         "number of load cases: the worst instant of each of so many equal intervals "
         "of the horizon [-]",
         ge=1,
-    )
-    worst: WorstBy = setting(
-        "compliance", "quantity that decides which instant of an interval is the worst [-]"
     )
     gradient: GradientKind = setting(
         "exact",
@@ -155,13 +149,11 @@ class Objective(Table):
     @field_validator("loads")
     @classmethod
     def _check_loads(cls, loads: tuple[Load | SpatialLoad, ...]) -> tuple[Load | SpatialLoad, ...]:
-        if not loads or not all(any(load) for load in loads):
-            raise Refusal("expected at least one load [F_x, F_y, moment], none of them all zero")
         sizes = [max(map(abs, load)) for load in loads]
-        if min(sizes) < 1.0 / LARGEST_LOAD or max(sizes) > LARGEST_LOAD:
+        if not loads or min(sizes) < 1.0 / LARGEST_LOAD or max(sizes) > LARGEST_LOAD:
             raise Refusal(
-                f"expected loads whose largest component is between {1.0 / LARGEST_LOAD:g} and "
-                f"{LARGEST_LOAD:g} [N, N m]"
+                "expected at least one load [F_x, F_y, moment], the largest component of each "
+                f"between {1.0 / LARGEST_LOAD:g} and {LARGEST_LOAD:g} [N, N m]"
             )
         return loads
 
@@ -179,9 +171,11 @@ class Objective(Table):
         """Whether the objective has a gradient with frozen equivalent static loads."""
         return self.needs("motion") and not self.response.exact
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what this objective, its gradient or the scenarios cannot have."""
-        self._check_weights(scene)
+        refuse_count(self.effort_weights, scene.driven, ".effort_weights")
+        if self.effort_weights is not None and not any(self.effort_weights):
+            raise Refusal("expected a number above 0 for one drive at least", ".effort_weights")
         self._check_unused(scene)
         self._check_attached(scene)
         self._check_static(scene)
@@ -202,26 +196,17 @@ class Objective(Table):
         self._check_exact(scene)
 
     def _check_exact(self, scene: Scene) -> None:
-        """Refuse reductions and integrators without adjoint where the gradient is exact."""
-        because, key = self._why_exact(scene)
-        remedy = '; or state objective.gradient = "esl"' if key[-1] == "gradient" else ""
-        if because and scene.reduction.method == "balanced":
+        """Refuse a reduction without adjoint where the gradient of the motion is exact."""
+        exact = [f'objective.kind = "{self.kind}"'] if self.response.exact else []
+        exact += [f"constraints.{key}" for key in scene.limits if limited_by(key).exact]
+        exact += ['objective.gradient = "exact" (state "esl")'] if self.gradient == "exact" else []
+        if exact and scene.reduction.method == "balanced":
             raise Refusal(
-                f'expected "craig-bampton", "modal" or "krylov" with {because}: '
-                f"the Gramian's basis has no adjoint{remedy}",
+                f'expected "craig-bampton", "modal" or "krylov" with {exact[0]}: the Gramian\'s '
+                "basis has no adjoint",
                 "reduction.method",
-                key,
+                exact[0].partition(" ")[0],
             )
-
-    def _why_exact(self, scene: Scene) -> tuple[str, Loc]:
-        """Return what asks for the exact gradient of a motion, and its key; "" if nothing does."""
-        if self.response.exact:
-            return f'objective.kind = "{self.kind}"', ("objective", "kind")
-        for key in scene.limits:
-            if limited_by(key).exact:
-                return f"constraints.{key}", ("constraints", key)
-        exact = 'objective.gradient = "exact"' if self.gradient == "exact" else ""
-        return exact, ("objective", "gradient")
 
     def _check_unused(self, scene: Scene) -> None:
         """Refuse options that neither the objective nor a limit uses."""
@@ -240,17 +225,6 @@ class Objective(Table):
         if not scene.scenarios:
             reason = "without [[scenarios]]: there are none to combine"
             self.refuse_stated(".scenarios", reason)
-
-    def _check_weights(self, scene: Scene) -> None:
-        if self.effort_weights is None:
-            return
-        drives = scene.driven
-        if len(self.effort_weights) != len(drives) or not any(self.effort_weights):
-            number = "1 number" if len(drives) == 1 else f"{len(drives)} numbers"
-            raise Refusal(
-                f"expected {number}, for {', '.join(drives)}, not all of them 0",
-                "objective.effort_weights",
-            )
 
     def static_loads(self, scene: Scene) -> tuple[Load | SpatialLoad, ...]:
         """Return the static load cases of the scene's arms."""
@@ -312,10 +286,6 @@ class ConstraintOptions(Table):
     settling_after: Instant = setting(
         0.0, "time from the beginning of each rest after which settling counts [s]"
     )
-    damping_below: Frequency | None = setting(
-        None,
-        "frequency below which poles count for constraints.damping_ratio; default: all do [Hz]",
-    )
     poles_at: tuple[Instant, ...] | None = setting(
         None, "instants at which poles count; default: start, middle and end of the motion [s]"
     )
@@ -337,7 +307,7 @@ class ConstraintOptions(Table):
             return self.poles_at
         return (0.0, 0.5 * motion.duration, motion.duration)
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse arrays that are not one limit for everything that has a value."""
         owners = {
             "peak_force": scene.driven,
@@ -347,7 +317,7 @@ class ConstraintOptions(Table):
         for key, names in owners.items():
             refuse_count(getattr(self, key), names, f".{key}")
         for index, var in enumerate(vars(self)["stiffness"] or ()):
-            var.check_at(scene, (*at, "stiffness", index))
+            var.check_at(scene, ("constraints", "stiffness", index))
         self._check_delay(scene.motion)
         self._check_poles(scene)
         self._check_arms(scene)
@@ -368,11 +338,9 @@ class ConstraintOptions(Table):
     def _check_poles(self, scene: Scene) -> None:
         """Refuse responses of poles without a closed loop, and options of none."""
         used = [response.name for response in asked(scene) if "poles_at" in response.options]
-        options = ("damping_below", "poles_at")
-        for key in unused_options(options, scene.objective.kind, self.limits):
-            users = " or ".join(f"constraints.{name}" for name in users_of(key)[1])
-            self.refuse_stated(f".{key}", f"without {users}: nothing else uses it")
         if not used:
+            reason = "without constraints.damping_ratio or pole_frequency: nothing else uses it"
+            self.refuse_stated(".poles_at", reason)
             return
         where = f".{used[0]}" if used[0] in self.limits else "objective.kind"
         if scene.control is None:
@@ -491,7 +459,7 @@ class Scenario(Table):
                 )
         return changes
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse changes of a material that are more than a factor of its stiffness."""
         for change in self.changes:
             table, _, key = change.partition("=")[0].strip().partition(".")

@@ -8,21 +8,22 @@ that a scene says of responses follows from here: the words of objective.kind, t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
 from dolfinopt.scene.tables.base import (
     DriveForce,
-    Loc,
     Refusal,
     Table,
     Three,
     TwoOrThree,
     setting,
 )
+from dolfinopt.scene.toml import tomllib
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -31,19 +32,13 @@ Direction = Literal["minimize", "maximize"]
 # What must be known beside the densities.
 Need = Literal["stiffness", "mass", "motion", "eigenproblem"]
 MOTION: frozenset[Need] = frozenset({"stiffness", "mass", "motion"})
-VIBRATION: frozenset[Need] = frozenset({"stiffness", "mass", "eigenproblem"})
 STATICS: frozenset[Need] = frozenset({"stiffness"})
 LARGEST_LOAD = 1e9  # N, N m
 
 # -- limits: their ranges --------------------------------------------------------------------------
 
-Mass = Annotated[float, Field(ge=1e-12, le=1e12)]  # kg
 Distance = Annotated[float, Field(ge=1e-15, le=1e4)]  # m
 Angle = Annotated[float, Field(ge=1e-15, le=math.pi)]  # rad
-Pressure = Annotated[float, Field(ge=1e-6, le=1e15)]  # Pa
-Frequency = Annotated[float, Field(ge=1e-6, le=1e9)]  # Hz
-Factor = Annotated[float, Field(ge=1e-3, le=1e3)]  # -
-Ratio = Annotated[float, Field(ge=-0.99, le=0.99)]  # -
 Component = Annotated[float, Field(ge=-LARGEST_LOAD, le=LARGEST_LOAD)]  # N, N m
 
 
@@ -76,22 +71,21 @@ class StiffnessCase(Table):
             turning = none
         return (*(force or none), *turning)
 
-    def check_in_scene(self, scene: Scene, at: Loc) -> None:
+    def check_in_scene(self, scene: Scene) -> None:
         """Refuse what is no arm with a design, no load on it, or without limit."""
         names = [arm.name for arm in scene.arms if arm.flexible]
         if self.arm not in names:
             raise Refusal(f"expected the name of an arm with a design: {', '.join(names)}", ".arm")
         if self.displacement is None and self.rotation is None:
-            raise Refusal("expected displacement or rotation, or both", at)
+            raise Refusal("expected displacement or rotation, or both", "")
         if not any(self.load):
-            raise Refusal("expected force or moment, not all of them zero", at)
+            raise Refusal("expected force or moment, not all of them zero", "")
         if len(self.load) != (6 if scene.is_spatial else 3):
             kind = "three components each" if scene.is_spatial else "two components and one number"
-            raise Refusal(f"expected force and moment of {kind} in this scene", at)
+            raise Refusal(f"expected force and moment of {kind} in this scene", "")
 
 
 Cases = tuple[StiffnessCase, ...]
-Positive = Annotated[float, Field(ge=1e-15, le=1e15)]  # of a response without a range of its own
 
 
 # -- declarations ----------------------------------------------------------------------------
@@ -112,7 +106,7 @@ class Limited:
     """
 
     help: str
-    type: Any = Positive
+    type: Any = Annotated[float, Field(ge=1e-15, le=1e15)]
     key: str = ""
     unit: str = ""
     lower: bool = False
@@ -180,245 +174,44 @@ class Declaration:
         return self.options if own is None else own
 
 
-DECLARED: dict[str, Declaration] = {
-    item.name: item
-    for item in (
-        Declaration(
-            "mass",
-            "mass of the designed arms",
-            "kg",
-            frozenset(),
-            Limited("upper limit of the mass of all arms together [kg]", Mass),
-            lighter=True,
-            of_nominal=True,
-            file="static",
-        ),
-        Declaration(
-            "esl",
-            "compliance of the load cases",
-            "N m",
-            limit=Limited(
-                "upper limit of the compliance of the load cases, as summary.json has it [N m]",
-                Positive,
-                "compliance",
-                options=(),
-            ),
-            options=("worst",),
-            file="motion",
-        ),
-        Declaration("integral_compliance", "integral of the compliance", "N m s", file="motion"),
-        Declaration(
-            "deviation",
-            "p-mean of the deviation",
-            "m",
-            limit=Limited("upper limit of the largest deviation of the end-effector [m]", Distance),
-            file="motion",
-        ),
-        Declaration(
-            "settling",
-            "p-mean of the deviation at rest",
-            "m",
-            limit=Limited(
-                "upper limit of the largest deviation in every rest: after the motion, and in "
-                "motion.dwells [m]",
-                Distance,
-            ),
-            of_phase=True,
-            file="motion",
-        ),
-        Declaration(
-            "orientation",
-            "p-mean of the end-effector's rotation",
-            "rad",
-            limit=Limited(
-                "upper limit of the largest rotation of the end-effector against that of rigid "
-                "links [rad]",
-                Angle,
-            ),
-            file="motion",
-        ),
-        Declaration(
-            "stress",
-            "p-mean of the von Mises stress",
-            "Pa",
-            limit=Limited(
-                "upper limit of the largest von Mises stress of all arms along the motion, relaxed "
-                "for intermediate density [Pa]",
-                Pressure,
-            ),
-            options=("stress_exponent",),
-            of_arms=True,
-            file="stress",
-        ),
-        Declaration(
-            "buckling",
-            "reciprocal of the buckling factor",
-            "-",
-            limit=Limited(
-                "lower limit of the buckling factor, by which all loads of an instant may grow "
-                "until an arm buckles, in the plane of a plane arm; above 1000 nothing buckles [-]",
-                Factor,
-                lower=True,
-            ),
-            stands_for="buckling factor",
-            natural="maximize",
-            exact=True,
-            of_arms=True,
-            file="buckling",
-        ),
-        Declaration(
-            "effort",
-            "effort of the drives",
-            "-",
-            limit=Limited(
-                "upper limit of the weighted root mean square of the drives' forces, see "
-                "objective.effort_weights [-]",
-            ),
-            options=("effort_weights",),
-            exact=True,
-            lighter=True,
-            file="motion",
-        ),
-        Declaration(
-            "peak_force",
-            "weighted sum of the drives' peak forces",
-            "-",
-            limit=Limited(
-                "upper limits of the largest force of every drive, the cart's first, then the "
-                "joints' from the base outwards; inf leaves one without limit [N, N m]",
-                tuple[DriveForce | None, ...],
-                options=(),
-            ),
-            options=("effort_weights",),
-            exact=True,
-            lighter=True,
-            file="motion",
-        ),
-        Declaration(
-            "eigenfrequency",
-            "squared longest periods",
-            "s2",
-            VIBRATION,
-            Limited(
-                "lower limit of the first natural frequency of every flexible arm with what it "
-                "carries (objective.attached), one for all or one for each [Hz]",
-                Frequency | tuple[Frequency, ...],
-                "first_frequency",
-                "Hz",
-                lower=True,
-                options=("attached", "elbow_angle", "modes"),
-            ),
-            options=("attached", "elbow_angle", "modes"),
-            stands_for="first frequency",
-            natural="maximize",
-            of_arms=True,
-            file="frequency",
-        ),
-        Declaration(
-            "damping_ratio",
-            "1 less the least damping ratio",
-            "-",
-            limit=Limited(
-                "lower limit of the least damping ratio of the closed loop's poles, of the machine "
-                "under [control] linearised at constraints.poles_at [-]",
-                Ratio,
-                lower=True,
-            ),
-            options=("poles_at", "damping_below"),
-            stands_for="least damping ratio",
-            natural="maximize",
-            exact=True,
-            file="poles",
-        ),
-        Declaration(
-            "pole_frequency",
-            "longest period",
-            "s",
-            limit=Limited(
-                "lower limit of the least natural frequency of the closed loop's poles [Hz]",
-                Frequency,
-                unit="Hz",
-                lower=True,
-            ),
-            options=("poles_at",),
-            stands_for="least frequency of the closed loop",
-            natural="maximize",
-            exact=True,
-            file="poles",
-        ),
-        Declaration(
-            "duration",
-            "duration of the motion",
-            "s",
-            frozenset(),
-            exact=True,
-            of_nominal=True,
-            file="law",
-        ),
-        *(
-            Declaration(
-                f"path_{what}",
-                f"largest {what} along the path",
-                unit,
-                frozenset(),
-                Limited("", stated=False),
-                objective=False,
-                exact=True,
-                of_nominal=True,
-                file="law",
-            )
-            for what, unit in (("speed", "m/s"), ("acceleration", "m/s2"), ("jerk", "m/s3"))
-        ),
-        Declaration(
-            "static",
-            "compliance under static loads",
-            "N m",
-            STATICS,
-            options=("loads",),
-            of_arms=True,
-            file="static",
-        ),
-        Declaration(
-            "tip_deflection",
-            "static deflection",
-            "m",
-            STATICS,
-            Limited(
-                "upper limit of the static deflection of the outboard interface of every designed "
-                "arm under objective.loads, one for all or one for each [m]",
-                Distance | tuple[Distance, ...],
-            ),
-            options=("loads",),
-            of_arms=True,
-            file="static",
-        ),
-        Declaration(
-            "stiffness",
-            "static displacement",
-            "m",
-            STATICS,
-            Limited("static load cases, each with the largest displacement [-]", Cases),
-            objective=False,
-            of_arms=True,
-            file="static",
-        ),
+# Limits that are no single number, and none for each of a kind.
+LIMIT_TYPES: dict[str, Any] = {"peak_force": tuple[DriveForce | None, ...], "stiffness": Cases}
+
+
+def _limited(
+    name: str,
+    *,
+    range: Sequence[float] = (1e-15, 1e15),
+    each: bool = False,
+    options: Sequence[str] | None = None,
+    **words: Any,
+) -> Limited:
+    """Return the limit of a response, as responses.toml has it."""
+    number: Any = Annotated[float, Field(ge=range[0], le=range[1])]
+    kind = LIMIT_TYPES.get(name, number | tuple[number, ...] if each else number)
+    return Limited(type=kind, options=None if options is None else tuple(options), **words)
+
+
+def _declaration(name: str, entry: dict[str, Any]) -> Declaration:
+    """Return what a scene says of a response, as responses.toml has it."""
+    limit = entry.pop("limit", None)
+    needs, options = entry.pop("needs", MOTION), entry.pop("options", ())
+    return Declaration(
+        name,
+        needs=frozenset(needs),
+        options=tuple(options),
+        limit=_limited(name, **limit) if limit else None,
+        **entry,
     )
+
+
+_FILE = Path(__file__).parents[1] / "responses.toml"
+DECLARED = {
+    name: _declaration(name, entry)
+    for name, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
 }
 # That of every design, or of all together, which [design] limits.
-VOLUME = Declaration(
-    "volume_fraction",
-    "volume",
-    "m3",
-    frozenset(),
-    Limited("", unit="-"),
-    objective=False,
-    of_nominal=True,
-    file="static",
-)
-
-# Older words of objective.kind and keys of [constraints].
-OLD_KINDS = {"compliance": "integral_compliance", "first_frequency": "eigenfrequency"}
-OLD_LIMITS = {"esl": "compliance"}
+VOLUME = DECLARED.pop("volume_fraction")
 
 
 def objective_kinds() -> list[str]:
