@@ -427,69 +427,34 @@ def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
     All designed arms are one grid, as few programs read collections, one below the other, in m;
     without one it is not written.
     """
-    if not (arms := designed(views)):
-        return
-    points, cells, offset, count = [], [], 0.0, 0
-    for view in arms:
-        own, corners = _merge_corners(view.corners)
-        points.append(np.pad(own, ((0, 0), (0, 3 - own.shape[1]))) + np.array([0.0, offset, 0.0]))
-        cells.append(corners + count)
-        offset -= 2.0 * np.ptp(own[:, 1])
-        count += len(own)
-    numbers = [k for k, view in enumerate(views) if view.designed]
-    fields: dict[str, list[Any]] = {
-        "density": [view.density for view in arms],
-        "arm": [np.full(len(view.density), k) for k, view in zip(numbers, arms, strict=True)],
-        "stress": [view.stress for view in arms],
-        "wall": [view.wall for view in arms],
-    }
-    known = {k: values for k, values in fields.items() if all(x is not None for x in values)}
-    kinds = [VTK_CELLS[view.corners.shape[2], view.corners.shape[1]] for view in arms]
-    _write_vtu(folder / "design.vtu", np.vstack(points), cells, kinds, known)
-
-
-def _write_vtu(
-    path: Path,
-    points: np.ndarray,
-    cells: Sequence[np.ndarray],
-    kinds: Sequence[int],
-    fields: Mapping[str, Any],
-) -> None:
-    """Write points (n, 3) and blocks of cells (m, corners), VTK's kind and fields of each."""
-    # VTK's own modules: PyVista takes 0.3 s more to import.
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+    import pyvista
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    grid, places, blocks = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
-    places.SetData(numpy_to_vtk(points, deep=True))
-    grid.SetPoints(places)
-    counts = np.concatenate([np.full(len(block), block.shape[1]) for block in cells])
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    connectivity = np.concatenate([block.ravel() for block in cells])
-    blocks.SetData(*(numpy_to_vtkIdTypeArray(x, deep=True) for x in (offsets, connectivity)))
-    types = np.repeat(np.array(kinds, dtype=np.uint8), [len(block) for block in cells])
-    grid.SetCells(numpy_to_vtk(types, deep=True), blocks)
-    for name, values in fields.items():
-        array = numpy_to_vtk(np.concatenate(values), deep=True)
-        array.SetName(name)
-        grid.GetCellData().AddArray(array)
-    grid.GetCellData().SetActiveScalars("density")
+    grids, below = pyvista.MultiBlock(), 0.0
+    for number, view in enumerate(views):
+        if not view.designed:
+            continue
+        cells, corners, dim = view.corners.shape
+        points = np.zeros((cells * corners, 3))
+        points[:, :dim] = view.corners.reshape(-1, dim)
+        points[:, 1] -= below
+        below += 2.0 * np.ptp(view.corners[:, :, 1])
+        nodes = np.arange(len(points)).reshape(cells, corners)
+        grid = pyvista.UnstructuredGrid({VTK_CELLS[dim, corners]: nodes}, points).clean()
+        fields = {"density": view.density, "arm": np.full(cells, number), "stress": view.stress,
+                  "wall": view.wall}  # fmt: skip
+        grid.cell_data.update({name: item for name, item in fields.items() if item is not None})
+        grids.append(grid)
+    if not len(grids):
+        return
+    every = grids.combine()  # with the fields that all arms have
+    every.set_active_scalars("density")
     writer = vtkXMLUnstructuredGridWriter()
-    writer.SetInputData(grid)
+    writer.SetInputData(every)
     writer.SetDataModeToBinary()
-    writer.WriteToOutputStringOn()
+    writer.WriteToOutputStringOn()  # a full disk is told
     writer.Write()
-    write_text(path, writer.GetOutputString())
-
-
-def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, d) and cells (n_cells, corners) of cells that share their corners."""
-    flat = corners.reshape(-1, corners.shape[2])
-    rounded = np.round(flat / (1e-9 * np.ptp(flat, axis=0).max()))
-    _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    return flat[kept], place.reshape(corners.shape[:2])
+    write_text(folder / "design.vtu", writer.GetOutputString())
 
 
 # -- history.csv: a line an iteration, written as it happens and read back -----------------------

@@ -102,7 +102,8 @@ def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
 
 def _elastic_units(trajectory: Trajectory) -> dict[str, str]:
     """Return the unit of every elastic coordinate by its column, and of every bearing's."""
-    scene, mechanism, units = trajectory.scene, trajectory.mechanism, {}
+    scene, mechanism = trajectory.scene, trajectory.mechanism
+    units: dict[str, str] = {}
     for arm, part in zip(scene.arms, mechanism.slices):
         # Of normalised modes: a unit of their own, which times the mode is a displacement.
         units |= {f"q_e_{arm.name}_{k + 1}": "modal" for k in range(part.stop - part.start)}
