@@ -273,17 +273,6 @@ animation_option = click.option(
 overwrite_option = click.option("--overwrite", is_flag=True, help="replace existing results")
 
 
-def old_option(*names: str, now: str, **settings: Any) -> Callable[..., Any]:
-    """Return an option of older command lines: it is read, and what stands for it now is told."""
-
-    def tell_now(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
-        if value not in (None, (), False, ""):
-            warn([f"{names[0]} is an older option: {now}"])
-        return value
-
-    return click.option(*names, hidden=True, help=now, callback=tell_now, **settings)
-
-
 def out_option(what: str) -> Callable[..., Any]:
     """Return the --out option of a command that writes a folder."""
     return click.option("--out", type=PATH, metavar="DIR", help=f"folder for {what}")

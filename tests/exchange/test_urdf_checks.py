@@ -214,7 +214,7 @@ def test_the_name_space_that_xacro_leaves_behind_is_no_xacro(tmp_path):
     file.write_text('<robot><link name="b"/></robot>')
     assert read_robot(file).name == "r"  # its file's, where it has none
     line = ["import", DEMO, DEMO_MOTION, "forearm"]
-    refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "folder")
+    refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "none")
 
 
 @pytest.mark.parametrize("how", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "above", "link"])
