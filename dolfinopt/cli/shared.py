@@ -38,7 +38,7 @@ from dolfinopt.output.folders import (
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.dynamics.build import Trajectory
+    from dolfinopt.optimization.result import Result
     from dolfinopt.optimization.state import HistoryRow
     from dolfinopt.output.design import ArmView
     from dolfinopt.responses.order_selection import OrderSelection
@@ -145,16 +145,7 @@ def _instead(folder: Path) -> str:
     return "name the folder of a finished optimize or simulate run"
 
 
-def draw(
-    folder: Path,
-    scene: Scene,
-    views: list[ArmView],
-    trajectory: Trajectory,
-    history: list[HistoryRow],
-    initial: Any,
-    *,
-    animation: bool = False,
-) -> None:
+def draw(result: Result, folder: Path, views: list[ArmView], *, animation: bool = False) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.output.design import designed
     from dolfinopt.plots.curves import (
@@ -168,6 +159,8 @@ def draw(
     from dolfinopt.plots.machine import draw_motion, machine_figure, make_film
     from dolfinopt.plots.style import save
 
+    scene, trajectory, history = result.scene, result.trajectory, result.rows
+    assert trajectory is not None
     title, bodies = scene.name, trajectory.mechanism.arms
     if arms := designed(views):
         masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
@@ -180,7 +173,7 @@ def draw(
         if (limits := limits_figure(scene, history)) is not None:
             save(limits, folder / "limits.png")
     if not scene.is_pinned:
-        save(deviation_of(trajectory, initial), folder / "deviation.png")
+        save(deviation_of(trajectory, result.initial_deviation), folder / "deviation.png")
     if trajectory.is_machine:
         save(drives_figure(trajectory), folder / "drives.png")
     if scene.motion.coefficients:
@@ -262,11 +255,6 @@ plots_option = click.option("--plots/--no-plots", default=_given_before("plots",
 
 verbose_option = click.option(
     "--verbose", is_flag=True, default=_given_before("verbose", False), hidden=True
-)
-
-
-animation_option = click.option(
-    "--animation", is_flag=True, help="also draw the moving machine: motion.gif"
 )
 
 

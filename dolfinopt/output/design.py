@@ -6,7 +6,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -271,12 +271,28 @@ def read_views(scene: Scene, path: Path) -> list[ArmView]:
 
     from dolfinopt.profiling import Profile
 
-    return gather_views(scene, *arms_with_design(MPI.COMM_SELF, scene, path, Profile()))
+    return gather_views(*arms_with_design(MPI.COMM_SELF, scene, path, Profile()))
+
+
+class Designed(NamedTuple):
+    """A scene's arms with a design, in the order in which functions of both take them.
+
+    Attributes:
+        scene: whose arms they are.
+        partition: which ranks do which arm.
+        arms: this rank's, by their places.
+        x_phys: (n_cells,) physical densities of each.
+    """
+
+    scene: Scene
+    partition: Partition
+    arms: Mapping[int, Arm]
+    x_phys: Mapping[int, np.ndarray]
 
 
 def arms_with_design(
     world: MPI.Comm, scene: Scene, design: Path | None, profile: Profile
-) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
+) -> Designed:
     """Build the arms; return them with the physical densities of a file, or the initial ones.
 
     Raises:
@@ -287,9 +303,9 @@ def arms_with_design(
 
     partition = partition_arms(world, scene.cell_counts, undivided=scene.dimension == 2)
     arms = build_arms(scene, partition, profile)
-    if design is not None:
-        return partition, arms, read_design(design, partition, arms)
-    return partition, arms, uniform_design(scene, partition, arms)
+    if design is None:
+        return Designed(scene, partition, arms, uniform_design(scene, partition, arms))
+    return Designed(scene, partition, arms, read_design(design, partition, arms))
 
 
 def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:

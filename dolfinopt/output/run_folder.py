@@ -19,11 +19,12 @@ from mpi4py import MPI
 from dolfinopt.errors import InputError
 from dolfinopt.optimization import loop
 from dolfinopt.optimization.loop import Report
-from dolfinopt.optimization.result import RankResult
+from dolfinopt.optimization.result import RankResult, simulation_result
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import (
     ArmView,
+    Designed,
     append_history,
     gather_views,
     write_design,
@@ -43,7 +44,9 @@ from dolfinopt.output.summary import summarise, write_budget, write_summary
 from dolfinopt.output.trajectory import write_trajectory
 from dolfinopt.parallel import Partition, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.stress_report import stress_report
+from dolfinopt.responses.evaluation import evaluate
+from dolfinopt.responses.order_selection import choose_coordinates
+from dolfinopt.responses.stress_report import ArmStress, stress_report
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import named_files, with_relative_paths
 
@@ -81,10 +84,7 @@ def write_result(
         pictures: draws the arms' views in a folder before the summary is written, on the root.
     """
     begun = time.perf_counter() - wall
-    stress = stress_report(result.partition, result.arms, result.trajectory, result.profile)
-    views = gather_views(
-        result.scene, result.partition, result.arms, result.x_phys, stress, result.x_filtered
-    )
+    views, stress = views_of(result)
     summary = summarise(result, wall, stress)
     with together(result.partition.world):
         if result.trajectory is None:
@@ -108,6 +108,19 @@ def write_result(
             summary["scene"] = with_relative_paths(summary["scene"], folder)
             write_summary(place, summary)
         return Written(views, summary)
+
+
+def views_of(result: RankResult) -> tuple[list[ArmView], dict[int, ArmStress]]:
+    """Return every arm as pictures need it, on the root, and stresses (collective)."""
+    stress = stress_report(result.partition, result.arms, result.trajectory, result.profile)
+    place = result.scene, result.partition, result.arms, result.x_phys
+    return gather_views(*place, stress, result.x_filtered), stress
+
+
+def simulated(design: Designed, profile: Profile) -> RankResult:
+    """Return the result of simulating a design (collective)."""
+    choice = choose_coordinates(*design, profile)
+    return simulation_result(*design, *evaluate(*design, profile), profile, choice)
 
 
 # -- an optimisation in a folder -------------------------------------------------------------
