@@ -99,21 +99,20 @@ def _write_scene(
 ) -> None:
     """Write scene, table and record, and say what they are."""
     from dolfinopt.loading import load_scene
-    from dolfinopt.output.folders import check_new, prepare_folder, write_new
+    from dolfinopt.output.folders import check_new, write_new
     from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
     new = scene.files(folder, t, rows)
-    *_, path = new
-    replaced: dict[Path, str | bytes] = {
-        folder / SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"
-    }
+    *_, name = new
+    path, kept = folder / name, ", or --overwrite to replace the import; an edited scene is kept"
+    replaced: dict[str, str | bytes]
+    replaced = {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"}
     if overwrite:
-        _keep_edited(path, new[path])
+        _keep_edited(path, new[name])
         new, replaced = {}, {**replaced, **new}
     else:
-        check_new(new, ", or --overwrite to replace the import; an edited scene is kept beside it")
-    prepare_folder(folder)
-    write_new(new, replaced)
+        check_new((folder / item for item in new), kept)
+    write_new(folder, new, replaced)
     click.echo(
         f"{path}: {len(scene.bodies)} arms, {rows.shape[1]} joints that move, "
         f"{float(t[-1]):g} s of motion"

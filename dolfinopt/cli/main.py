@@ -76,10 +76,10 @@ def init(name: Path, template: str, older: str | None) -> None:
         text = source.read_text(encoding="utf-8")
         for mark, value in (("@NAME@", title), ("@STEM@", path.stem)):
             text = text.replace(f'"{mark}', '"' + json.dumps(value, ensure_ascii=False)[1:-1])
-        texts[path.with_suffix(source.suffix)] = text
+        texts[path.with_suffix(source.suffix).name] = text
     schema = path.with_name(SCHEMA_FILE)
-    write_new(texts, {schema: json.dumps(scene_schema(), indent=2) + "\n"})
-    written = ", ".join(os.fspath(item) for item in texts)
+    write_new(path.parent, texts, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"})
+    written = ", ".join(os.fspath(path.with_name(name)) for name in texts)
     click.echo(f"{written}: edit the values that differ for your machine")
     click.echo(f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)")
     if template == "step":

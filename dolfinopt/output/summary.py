@@ -73,6 +73,8 @@ SUMMARY_UNITS = {
     "peak_memory_mb": "MB",
 }
 
+CONTACTS = "pieces", "corners", "edges", "places", "left_out", "remaining"  # of `Contacts`
+
 CERTIFICATE_UNITS = {
     "kkt": "-",
     "gradient_angle": "degree",
@@ -229,7 +231,10 @@ def _of_designs(run: RankResult, traits: Mapping[int, _Traits]) -> dict[str, Any
         "grayness": _grayness(traits),
         "volume_fraction": {name: item.volume_fraction for name, item in by_arm.items()},
         "connected": max((trait.contacts.pieces for trait in traits.values()), default=0),
-        "contacts": {name: _contacts(item.contacts) for name, item in by_arm.items()},
+        "contacts": {
+            name: {key: np.array(getattr(item.contacts, key)).tolist() for key in CONTACTS}
+            for name, item in by_arm.items()
+        },
         "minimum_member_measured": {name: _size(item.widths[0]) for name, item in by_arm.items()},
         "minimum_gap_measured": {name: _size(item.widths[1]) for name, item in by_arm.items()},
         "too_narrow": [asdict(item) for item in _too_narrow(run, traits)],
@@ -295,18 +300,6 @@ def _too_narrow(run: RankResult, traits: Mapping[int, _Traits]) -> list[_Narrow]
         )
         if width is not None and width.size < asked * (1.0 - 1e-9)
     ]
-
-
-def _contacts(contacts: Contacts) -> dict[str, Any]:
-    """Return the entry of an arm's contacts."""
-    return {
-        "pieces": contacts.pieces,
-        "corners": contacts.corners,
-        "edges": contacts.edges,
-        "places": contacts.places.tolist(),
-        "left_out": contacts.left_out,
-        "remaining": contacts.remaining,
-    }
 
 
 def _first_frequencies(run: RankResult, by_arm: Mapping[str, _Traits]) -> dict[str, float]:

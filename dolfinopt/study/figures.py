@@ -127,9 +127,7 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
             _label(axes, design, what, "samples [-]")
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             share = axes.twinx()
-            share.step(np.sort(values), np.arange(1, len(values) + 1) / len(values), where="post",
-                       color=GREY)  # fmt: skip
-            share.set_ylim(0.0, 1.0)
+            share.ecdf(values, color=GREY)
             share.set_ylabel("share of samples below [-]", color=GREY)
     return drawn
 

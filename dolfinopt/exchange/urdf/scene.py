@@ -163,15 +163,15 @@ class RobotScene:
         """Return the name of a solid's mesh file."""
         return f"{self.arms[body.link]}.msh"
 
-    def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[Path, str | bytes]:
-        """Return all files of a folder, the scene last: where it is, the others are.
+    def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[str, str | bytes]:
+        """Return all files of a folder by their names, the scene last: where it is, all are.
 
         Args:
             folder: of the scene.
             t, rows: (n,) s, (n, joints) of all joints that move, then of driven rods.
         """
-        new: dict[Path, str | bytes] = {
-            folder / self.mesh_name(item): item.mesh.data for item in self.bodies if item.mesh
+        new: dict[str, str | bytes] = {
+            self.mesh_name(item): item.mesh.data for item in self.bodies if item.mesh
         }
         columns = [*(joint.name for joint in self.robot.movable), *self.loops.rods]
         kept = [k for k, name in enumerate(columns) if name not in self.loops.passive]
@@ -179,7 +179,7 @@ class RobotScene:
         lines = [",".join(["t", *names])]
         table = np.column_stack([t, rows[:, kept]])
         lines += [",".join(map(repr, map(float, row))) for row in table]
-        new[folder / TRAJECTORY] = "\n".join(lines) + "\n"
+        new[TRAJECTORY] = "\n".join(lines) + "\n"
         # What `export RUN robot` needs: the file, and every solid's link and frame.
         urdf = Path(os.path.relpath(self.robot.file.absolute(), folder.absolute())).as_posix()
         solids = {
@@ -187,8 +187,8 @@ class RobotScene:
             for body in self.bodies
             if body.is_solid
         }
-        new[folder / RECORD] = json.dumps({"urdf": urdf, "solids": solids}, indent=2) + "\n"
-        return new | {folder / f"{self.robot.file.stem}.toml": self.text()}
+        new[RECORD] = json.dumps({"urdf": urdf, "solids": solids}, indent=2) + "\n"
+        return new | {f"{self.robot.file.stem}.toml": self.text()}
 
 
 @dataclass(frozen=True, eq=False)
