@@ -40,57 +40,14 @@ from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.stress_report import ArmStress, unjudged
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
+from dolfinopt.scene.toml import tomllib
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
     from dolfinopt.optimization.result import RankResult, Result
 
-# Of summary.json's figures; those without a unit are "-". Constraints state theirs themselves.
-SUMMARY_UNITS = {
-    "compliance": "N m",
-    "max_deviation": "m",
-    "max_deviation_time": "s",
-    "max_rotation": "rad",
-    "settling": "m",
-    "loop_start": "rad, m",
-    "deflection_budget": "m, shares -",
-    "stress": "Pa",
-    "mass": "kg",
-    "designed_mass": "kg",
-    "grayness": "-",
-    "volume_fraction": "-",
-    "connected": "-",
-    "contacts": "-",
-    "minimum_member_measured": "m",
-    "minimum_gap_measured": "m",
-    "too_narrow": "m",
-    "first_frequency": "Hz",
-    "first_frequency_error": "-",
-    "loaded_frequency": "Hz",
-    "simulation_error_estimate": "-",
-    "kkt": "-",
-    "seconds": "s",
-    "peak_memory_mb": "MB",
-}
-
+UNITS = tomllib.loads(Path(__file__).with_name("units.toml").read_text(encoding="utf-8"))
 CONTACTS = "pieces", "corners", "edges", "places", "left_out", "remaining"  # of `Contacts`
-
-CERTIFICATE_UNITS = {
-    "kkt": "-",
-    "gradient_angle": "degree",
-    "gradient_ratio": "-",
-    "seconds": "s",
-}
-
-HISTORY_UNITS = {
-    "max_deviation": "m",
-    "grayness": "-",
-    "volume_fraction": "-",
-    "change": "-",
-    "seconds": "s",
-    "kkt": "-",
-    "merit": "-",
-}
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
 # length has a slope of 0.15 to 0.2 at its end and is 0.6 % shorter, which linear elasticity leaves
@@ -480,8 +437,8 @@ def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | N
 def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
     """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
     unit = scene.objective.response.unit
-    units: dict[str, Any] = {"objective": unit, **SUMMARY_UNITS}
-    units["certificate"] = {**CERTIFICATE_UNITS, "exact_objective": unit}
+    units: dict[str, Any] = {"objective": unit, **UNITS["summary"]}
+    units["certificate"] = {**UNITS["certificate"], "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
     if free := free_drives(scene):
         rigid = scene.rigid_units
@@ -490,7 +447,7 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
         parts = {closure.name: closure.parts(scene.dimension) for closure in scene.closures}
         units["closure_peak"] = {name: {u: u for _, u in own} for name, own in parts.items()}
         units |= {} if scene.is_spatial else {"closure_force_peak": "N"}
-    units["history.csv"] = {"objective": unit, **HISTORY_UNITS, "multipliers": unit}
+    units["history.csv"] = {"objective": unit, **UNITS["history"], "multipliers": unit}
     if trajectory is not None:
         units["trajectory.csv"] = trajectory_units(trajectory)
     return units
