@@ -240,7 +240,7 @@ class SimulationResult(Result):
         """
         from dolfinopt.output.summary import motion_warnings
 
-        return () if self.trajectory is None else tuple(motion_warnings(self))
+        return () if self.trajectory is None else tuple(motion_warnings(self, self.trajectory))
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write the files of `dolfinopt simulate` or `optimize`, but for pictures (collective).

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -145,9 +145,10 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
 
 
 def summary_of_feed_forward(
-    scene: Scene, feed_forward: FeedForward | None, comparison: Comparison | None
+    trajectory: Trajectory, comparison: Comparison | None
 ) -> dict[str, Any] | None:
     """Return what summary.json tells of a feed-forward; None without."""
+    scene, feed_forward = trajectory.scene, trajectory.feed_forward
     if feed_forward is None or comparison is None:
         return None
     names, units = list(scene.rigid_units), list(scene.rigid_units.values())
@@ -188,15 +189,15 @@ def slowest_unstable_rate(feed_forward: FeedForward) -> float | None:
     return float(unstable.min()) if len(unstable) else None
 
 
-def lead_warnings(trajectory: Trajectory | None, grey: bool) -> list[str]:
-    """Return that corrections would begin earlier than the lead lets them, and what to do."""
-    if trajectory is None or trajectory.feed_forward is None:
-        return []
+def lead_warnings(trajectory: Trajectory, grey: bool) -> Iterator[str]:
+    """Yield that corrections would begin earlier than the lead lets them, and what to do."""
+    if trajectory.feed_forward is None:
+        return
     rate, lead = slowest_unstable_rate(trajectory.feed_forward), trajectory.scene.lead
-    if rate is None or not 0.0 < lead < 3.0 / rate:
-        return []
-    cells = "nearly void cells of a grey design vibrate slowly: set design.projection, or "
-    return [
-        f"feed-forward: the corrections would begin about {3e3 / rate:.2g} ms before the motion, "
-        f"which feed_forward.lead = {lead:g} [s] cuts off; {cells if grey else ''}raise it"
-    ]
+    if rate is not None and 0.0 < lead < 3.0 / rate:
+        cells = "nearly void cells of a grey design vibrate slowly: set design.projection, or "
+        yield (
+            f"feed-forward: the corrections would begin about {3e3 / rate:.2g} ms before the "
+            f"motion, which feed_forward.lead = {lead:g} [s] cuts off; "
+            f"{cells if grey else ''}raise it"
+        )
