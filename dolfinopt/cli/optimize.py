@@ -121,9 +121,9 @@ def _conclude(folder: Path, result: RankResult, plots: bool, verbose: bool) -> N
     from dolfinopt.output.run_folder import write_result
 
     pictures = partial(draw, result) if plots else None
-    written = write_result(folder, result, elapsed(), pictures=pictures)
-    if written is not None:
-        conclude(result, written.summary, folder, verbose)
+    summary = write_result(folder, result, elapsed(), pictures=pictures)
+    if summary is not None:
+        conclude(result, summary, folder, verbose)
 
 
 # -- `dolfinopt simulate` ------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,14 +55,6 @@ if TYPE_CHECKING:
 Draw = Callable[[Path, list[ArmView]], None]
 
 
-@dataclass(frozen=True)
-class Written:
-    """What the root wrote: every arm as pictures need it, and the content of summary.json."""
-
-    views: list[ArmView]
-    summary: Mapping[str, Any]
-
-
 def write_result(
     folder: Path,
     result: RankResult,
@@ -71,10 +62,10 @@ def write_result(
     *,
     paraview: bool = True,
     pictures: Draw | None = None,
-) -> Written | None:
+) -> Mapping[str, Any] | None:
     """Write design, trajectory and summary of a result, all or none (collective).
 
-    Returns None but on the root.
+    Returns the content of summary.json; None but on the root.
 
     Args:
         folder: exists; of an optimisation history and checkpoint are there already.
@@ -107,7 +98,7 @@ def write_result(
             summary["files"] = {name: row[key] for name, row, key in named_files(summary["scene"])}
             summary["scene"] = with_relative_paths(summary["scene"], folder)
             write_summary(place, summary)
-        return Written(views, summary)
+        return summary
 
 
 def views_of(result: RankResult) -> tuple[list[ArmView], dict[int, ArmStress]]:
