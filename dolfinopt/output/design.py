@@ -35,9 +35,6 @@ if TYPE_CHECKING:
     from dolfinopt.responses.stress_report import ArmStress
 
 
-CIRCLE = 48  # corners that stand for a circle in pictures
-
-
 @dataclass(frozen=True, eq=False)
 class ArmView:
     """One whole arm on the root, cells in the order of their centroids.
@@ -151,16 +148,15 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
     scale = np.array([arm.length / pattern.length, arm.height / pattern.height])
     outlines = []
     for region in pattern.regions:
-        x0, y0, x1, y1 = region.bounds
-        if region.box is not None:
-            points = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-        else:
-            turn = np.exp(2j * np.pi * np.arange(CIRCLE) / CIRCLE)
-            radius = 0.5 * (x1 - x0)
-            points = np.column_stack([x0 + radius * (1 + turn.real), y0 + radius * (1 + turn.imag)])
-        outlines.append((region.kind, points * scale))
-        if pattern.symmetric_about[0]:
-            outlines.append((region.kind, points * scale * [1.0, -1.0]))
+        import shapely
+
+        shape = shapely.box(*region.bounds)
+        if region.circle is not None:
+            *centre, radius = region.circle
+            shape = shapely.Point(centre).buffer(radius)
+        for mirror in (1.0, -1.0) if pattern.symmetric_about[0] else (1.0,):
+            points = np.array(shape.exterior.coords) * scale * [1.0, mirror]
+            outlines.append((region.kind, points))
     return tuple(outlines)
 
 
