@@ -88,7 +88,6 @@ def summarise(
         return {
             "name": scene.name,
             **_figures(run.evaluation),
-            "max_deviation_time": run.evaluation.max_deviation_time,
             **_machine(trajectory),
             "loop_start": loop_start(scene),
             "feed_forward": summary_of_feed_forward(trajectory, comparison),
@@ -128,13 +127,9 @@ def figures(run: RankResult, wall: float) -> dict[str, Any]:
         run: the design and what came of it.
         wall: seconds that it took.
     """
-    volumes = {k: _volume(run.scene, k, arm) for k, arm in run.arms.items()}
-    grayness = sum(volumes[k] * arm.grayness(run.x_phys[k]) for k, arm in run.arms.items())
     return {
         "name": run.scene.name,
         **_figures(run.evaluation),
-        "max_deviation_time": run.evaluation.max_deviation_time,
-        "grayness": grayness / (sum(volumes.values()) or 1.0),
         "iterations": run.iterations,
         "stop_reason": run.stop_reason,
         "seconds": {"total": wall},
@@ -459,7 +454,7 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         arm.volume_fraction(x_phys),
         arm.grayness(x_phys),
         (scene.arms[index].cells and scene.arms[index].cell_size) or arm.mesh.cell_size,
-        _volume(scene, index, arm),
+        len(arm.places) * scene.arms[index].depth * arm.mesh.comm.allreduce(arm.mesh.area.sum()),
         tuple(arm.mesh.notes),
         arm.contacts(arm.kind.share(x_phys) > SOLID),
     )
@@ -585,17 +580,12 @@ def _unstiffened(stiffening: Stiffening | None) -> Iterator[str]:
         )
 
 
-def _volume(scene: Scene, index: int, arm: Arm) -> float:
-    """Return the volume of all arms with one design, m3."""
-    area = arm.mesh.comm.allreduce(arm.mesh.area.sum())
-    return float(len(arm.places) * scene.arms[index].depth * area)
-
-
 def _figures(evaluation: Motion) -> dict[str, float]:
     return {
         "objective": evaluation.objective,
         "compliance": evaluation.compliance,
         "max_deviation": evaluation.max_deviation,
+        "max_deviation_time": evaluation.max_deviation_time,
     }
 
 

@@ -371,7 +371,7 @@ class _Place:
             result["samples"] = {name: np.array(values, float) for name, values in samples.items()}
             result["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
         elif not failed:
-            result |= {name: data[name] for name in FIGURES}
+            result |= {name: data[name] for name in FIGURES if name in data}
         if not failed:
             result["seconds"] = data["seconds"]["total"]
         return Outcome(case, self[case], **result)
