@@ -26,7 +26,6 @@ from dolfinopt.errors import InputError
 from dolfinopt.interrupt import ending_at_once
 
 if TYPE_CHECKING:
-    import numpy as np
     from mpi4py import MPI
 
     from dolfinopt.exchange.urdf.scene import RobotScene
@@ -84,25 +83,24 @@ def import_robot(
             with ending_at_once():
                 from dolfinopt.exchange.urdf.file import read_robot
                 from dolfinopt.exchange.urdf.scene import scene_of_robot
-                from dolfinopt.mesh.solid_cells import msh_bytes
 
                 known = os.environ.get("ROS_PACKAGE_PATH", "")
                 os.environ["ROS_PACKAGE_PATH"] = os.pathsep.join([*package_path, known])
                 model = read_robot(robot)
-                write_mesh = None if boxes else msh_bytes
-                result = scene_of_robot(model, chosen, tool, table, closures, write_mesh, warn)
-            _write_scene(out or Path(robot.stem), overwrite, *result)
+                scene, t, rows = scene_of_robot(model, chosen, tool, table, closures, boxes, warn)
+                folder = out or Path(robot.stem)
+                new = scene.files(folder, t, rows)
+            _write_scene(folder, overwrite, scene, new, rows.shape[1])
 
 
 def _write_scene(
-    folder: Path, overwrite: bool, scene: RobotScene, t: np.ndarray, rows: np.ndarray
+    folder: Path, overwrite: bool, scene: RobotScene, new: dict[str, str | bytes], joints: int
 ) -> None:
     """Write scene, table and record, and say what they are."""
     from dolfinopt.loading import load_scene
     from dolfinopt.output.folders import check_new, write_new
     from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
-    new = scene.files(folder, t, rows)
     *_, name = new
     path, kept = folder / name, ", or --overwrite to replace the import; an edited scene is kept"
     replaced: dict[str, str | bytes]
@@ -114,14 +112,14 @@ def _write_scene(
         check_new((folder / item for item in new), kept)
     write_new(folder, new, replaced)
     click.echo(
-        f"{path}: {len(scene.bodies)} arms, {rows.shape[1]} joints that move, "
-        f"{float(t[-1]):g} s of motion"
+        f"{path}: {len(scene.bodies)} arms, {joints} joints that move, "
+        f"{scene.duration:g} s of motion"
     )
     for body in scene.bodies:
         if body.size is not None:
             sides = " x ".join(f"{item:.3g}" for item in (body.length, *body.size))
             box = "a box to edit" if body.measured else "a box of guessed height and thickness"
-            what = box if body.mesh is None else f"its shape, {body.mesh.cells} cells"
+            what = box if body.mesh is None else f"its shape, {len(body.mesh.cells)} cells"
             click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}; {scene.masses(body)}")
             if body.mesh is not None and body.mesh.done:
                 click.echo(f"{scene.arms[body.link]}: {'; '.join(body.mesh.done)}")
