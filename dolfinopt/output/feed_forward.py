@@ -17,7 +17,7 @@ from dolfinopt.dynamics.build import Trajectory, simulate
 from dolfinopt.dynamics.feed_forward import FeedForward, internal_rates
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.design import Designed
-from dolfinopt.output.trajectory import drive_units
+from dolfinopt.output.trajectory import UNITS, drive_units
 from dolfinopt.parallel import gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.csv_table import BESIDE_JOINTS
@@ -167,15 +167,9 @@ def summary_of_feed_forward(
         "corrections": {names[k]: float(x) for k, x in zip(joints, largest, strict=True)},
         "slowest_unstable_rate": slowest_unstable_rate(feed_forward),
         "units": {
-            "lead": "s",
-            "knots": "-",
-            "regularity": "-",
-            "deviation_without": "m",
-            "deviation_left": "m",
-            "deviation_left_finer": "m",
+            **UNITS["feed_forward"],
             "drive_peak_without": drive_units(scene),
             "corrections": ", ".join(units[k] for k in joints),
-            "slowest_unstable_rate": "1/s",
         },
     }
 

@@ -27,11 +27,7 @@ from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
 from dolfinopt.output.feed_forward import comparison_of, lead_warnings, summary_of_feed_forward
 from dolfinopt.output.joint_limits import joint_limits
 from dolfinopt.output.torsion import torsion_warnings
-from dolfinopt.output.trajectory import (
-    drive_units,
-    free_drives,
-    trajectory_units,
-)
+from dolfinopt.output.trajectory import UNITS, drive_units, free_drives, trajectory_units
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
 from dolfinopt.profiling import Counts
 from dolfinopt.responses.constraints import limits_of, summary_of
@@ -40,13 +36,11 @@ from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.responses.stress_report import ArmStress, unjudged
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
-from dolfinopt.scene.toml import tomllib
 from dolfinopt.version import __version__
 
 if TYPE_CHECKING:
     from dolfinopt.optimization.result import RankResult, Result
 
-UNITS = tomllib.loads(Path(__file__).with_name("units.toml").read_text(encoding="utf-8"))
 CONTACTS = "pieces", "corners", "edges", "places", "left_out", "remaining"  # of `Contacts`
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
