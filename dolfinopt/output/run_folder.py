@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,6 +53,7 @@ from dolfinopt.scene.schema import named_files, with_relative_paths
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
+HISTORY = "history.csv"
 Draw = Callable[[Path, list[ArmView]], None]
 
 
@@ -117,23 +119,29 @@ def simulated(design: Designed, profile: Profile) -> RankResult:
 # -- an optimisation in a folder -------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
 class FolderRecorder:
-    """Writes history.csv and checkpoint.npz, see `loop.Recorder`."""
+    """Writes history.csv and checkpoint.npz, see `loop.Recorder`.
 
-    def __init__(self, folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
-        """Take the folder, which exists, and what the checkpoint describes."""
-        self.folder, self.scene, self.partition, self.arms = folder, scene, partition, arms
-        self.history = folder / "history.csv"
+    Attributes:
+        folder: exists.
+        scene, partition, arms: what the checkpoint describes.
+    """
+
+    folder: Path
+    scene: Scene
+    partition: Partition
+    arms: Mapping[int, Arm]
 
     def begin(self, rows: Sequence[HistoryRow]) -> None:
         """Write the history anew with the rows known so far (collective)."""
         with together(self.partition.world):
             if self.partition.world.rank == 0:
-                write_history(self.history, rows)
+                write_history(self.folder / HISTORY, rows)
 
     def append(self, row: HistoryRow) -> None:
         """Add a line to the history (root only)."""
-        append_history(self.history, row)
+        append_history(self.folder / HISTORY, row)
 
     def save(self, memory: Memory) -> None:
         """Replace the checkpoint (collective)."""

@@ -301,8 +301,8 @@ def _shape(file: Path, element: _Element) -> Trimesh:
     """Return the surface of a shape of a link."""
     from trimesh import creation
 
-    found = element.xml.find("geometry/*")
-    kind = None if found is None else found.tag
+    shape = element.xml.find("geometry/*")
+    kind = None if shape is None else shape.tag
     if kind == "mesh":
         return _mesh(file, element)
     if kind not in SIZES:
