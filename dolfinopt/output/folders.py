@@ -68,7 +68,7 @@ def prepare_folder(folder: Path) -> None:
         if error.errno in FULL:
             raise unwritten(folder, error) from error
         raise InputError(
-            f"{folder}: cannot be written ({error.strerror}); name a folder you may write"
+            f"{folder}: cannot be written ({error.strerror}); name a folder you may write with --out"
         ) from None
 
 
