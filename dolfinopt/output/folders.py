@@ -65,11 +65,8 @@ def prepare_folder(folder: Path) -> None:
         probe.write_bytes(b"")
         probe.unlink()
     except OSError as error:
-        if error.errno in FULL:
-            raise unwritten(folder, error) from error
-        raise InputError(
-            f"{folder}: cannot be written ({error.strerror}); name a folder you may write with --out"
-        ) from None
+        reason = unwritten(folder, error)
+        raise reason if error.errno in FULL else InputError(str(reason)) from None
 
 
 @contextmanager
