@@ -26,7 +26,7 @@ from dolfinopt.output.feed_forward import finer_deviation, simulated_with, with_
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.cases import Case, Outcome, Steps
-from dolfinopt.study.studies import DEVIATION, deviation_panels, single_design
+from dolfinopt.study.studies import DEVIATION, deviation_panels, results_of, single_design
 from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "motions"  # of the study's files, and of the folder of the shaped joints
@@ -193,14 +193,14 @@ def _verdict(able: Sequence[Outcome]) -> str:
 
 def _cells(scene: Scene, motion: Motion, outcome: Outcome) -> dict[str, Any]:
     """Return a row by column."""
-    summary = outcome.summary()
+    summary, known = outcome.summary(), results_of(outcome)
     cells: dict[str, Any] = {
         "motion": motion.case.label,
-        "mass [kg]": summary.get("designed_mass", math.nan),
+        "mass [kg]": known["mass [kg]"],
         "longer by [s]": motion.longer,
-        DEVIATION: 1e3 * outcome.max_deviation,
+        DEVIATION: known[DEVIATION],
         "finer model [mm]": math.nan if motion.finer is None else 1e3 * motion.finer,
-        "settling [mm]": 1e3 * summary.get("settling", math.nan),
+        "settling [mm]": known["settling [mm]"],
     }
     for name, result in zip(machines(scene), summary.get("scenarios", ()), strict=False):
         cells[f"{name} [mm]"] = 1e3 * result["max_deviation"]
