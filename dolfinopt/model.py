@@ -240,7 +240,7 @@ class SimulationResult(Result):
         """
         from dolfinopt.output.summary import motion_warnings
 
-        return () if self.trajectory is None else tuple(motion_warnings(self))
+        return () if self.trajectory is None else tuple(motion_warnings(self, self.trajectory))
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> None:
         """Write the files of `dolfinopt simulate` or `optimize`, but for pictures (collective).
@@ -494,7 +494,7 @@ class Model:
                 neither `resume` nor `overwrite` is set; another run works there.
             ConvergenceError: a simulation failed.
         """
-        from dolfinopt.output.run_folder import optimize, write_result  # with the optimiser
+        from dolfinopt.output.run_folder import optimize, views_of, write_result
 
         begun, place = time.perf_counter(), None if folder is None else Path(folder)
         partition, arms = self._arms()
@@ -512,11 +512,10 @@ class Model:
         )
         if place is not None:
             write_result(place, result, time.perf_counter() - begun)
-        stress = stress_report(result.partition, result.arms, result.trajectory, result.profile)
         return OptimizationResult(
             **_fields(result),
             design=self._gathered(result.x_phys, result.partition),
-            views=gather_views(self.scene, result.partition, result.arms, result.x_phys, stress),
+            views=views_of(result)[0],
             filtered=self._gathered(result.x_filtered or {}, result.partition),
         )
 

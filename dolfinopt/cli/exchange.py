@@ -6,7 +6,7 @@ import itertools
 import json
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,7 +14,6 @@ from dolfinopt.cli.shared import (
     PATH,
     design_option,
     load,
-    old_option,
     out_option,
     overwrite_option,
     scene_argument,
@@ -27,10 +26,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.interrupt import ending_at_once
 
 if TYPE_CHECKING:
-    import numpy as np
     from mpi4py import MPI
 
-    from dolfinopt.exchange.urdf.robot import Robot
     from dolfinopt.exchange.urdf.scene import RobotScene
     from dolfinopt.scene.load import Scene
 
@@ -38,16 +35,14 @@ if TYPE_CHECKING:
 @click.command(name="import")
 @click.argument("robot", type=PATH)
 @click.argument("words", nargs=-1, metavar="TABLE LINK...")
-@old_option("--links", now="import ROBOT TABLE LINK...", default="")
-@old_option("--trajectory", now="import ROBOT TABLE LINK...")
 @click.option(
     "--tool", metavar="LINK", help="end-effector; default: end of the chosen links' chain"
 )
-@old_option(
+@click.option(
     "--package-path",
-    now="state folders with ROS packages in ROS_PACKAGE_PATH",
+    hidden=True,  # older than ROS_PACKAGE_PATH here
     multiple=True,
-    type=click.Path(path_type=Path),
+    type=click.Path(exists=True, file_okay=False),
 )
 @click.option(
     "--closures",
@@ -62,10 +57,8 @@ if TYPE_CHECKING:
 def import_robot(
     robot: Path,
     words: tuple[str, ...],
-    links: str,
-    trajectory: str | None,
     tool: str | None,
-    package_path: tuple[Path, ...],
+    package_path: tuple[str, ...],
     closures: Path | None,
     boxes: bool,
     overwrite: bool,
@@ -78,7 +71,7 @@ def import_robot(
     rigid. Packages of package:// are looked for in ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the
     folders above ROBOT. Impossible inertias and joints beyond their limits are reported.
     """
-    table, *names = [*([] if trajectory is None else [trajectory]), *words, links]
+    table, *names = words or ("",)
     chosen = tuple(name for word in ",".join(names).split(",") if (name := word.strip()))
     if not chosen:
         raise InputError("import: expected a table and links: dolfinopt import ROBOT TABLE LINK...")
@@ -88,57 +81,45 @@ def import_robot(
     with together(world):
         if world.rank == 0:
             with ending_at_once():
+                from dolfinopt.exchange.urdf.file import read_robot
                 from dolfinopt.exchange.urdf.scene import scene_of_robot
-                from dolfinopt.mesh.solid_cells import msh_bytes
 
-                model = _robot(robot, package_path)
-                write_mesh = None if boxes else msh_bytes
-                result = scene_of_robot(model, chosen, tool, table, closures, write_mesh, warn)
-            _write_scene(out or Path(robot.stem), overwrite, *result)
-
-
-def _robot(file: Path, package_path: tuple[Path, ...]) -> Robot:
-    """Return the robot, its packages looked for in folders that are there."""
-    from dolfinopt.exchange.urdf.file import read_robot
-
-    for folder in package_path:
-        if not folder.is_dir():
-            raise InputError(f"--package-path {folder}: expected a folder with ROS packages")
-    if package_path:
-        known = os.environ.get("ROS_PACKAGE_PATH", "")
-        os.environ["ROS_PACKAGE_PATH"] = os.pathsep.join([*map(str, package_path), known])
-    return read_robot(file)
+                known = os.environ.get("ROS_PACKAGE_PATH", "")
+                os.environ["ROS_PACKAGE_PATH"] = os.pathsep.join([*package_path, known])
+                model = read_robot(robot)
+                scene, t, rows = scene_of_robot(model, chosen, tool, table, closures, boxes, warn)
+                folder = out or Path(robot.stem)
+                new = scene.files(folder, t, rows)
+            _write_scene(folder, overwrite, scene, new, rows.shape[1])
 
 
 def _write_scene(
-    folder: Path, overwrite: bool, scene: RobotScene, t: np.ndarray, rows: np.ndarray
+    folder: Path, overwrite: bool, scene: RobotScene, new: dict[str, str | bytes], joints: int
 ) -> None:
     """Write scene, table and record, and say what they are."""
     from dolfinopt.loading import load_scene
-    from dolfinopt.output.folders import check_new, prepare_folder, write_new
+    from dolfinopt.output.folders import check_new, write_new
     from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
-    new = scene.files(folder, t, rows)
-    *_, path = new
-    replaced: dict[Path, str | bytes] = {
-        folder / SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"
-    }
+    *_, name = new
+    path, kept = folder / name, ", or --overwrite to replace the import; an edited scene is kept"
+    replaced: dict[str, str | bytes]
+    replaced = {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"}
     if overwrite:
-        _keep_edited(path, new[path])
+        _keep_edited(path, new[name])
         new, replaced = {}, {**replaced, **new}
     else:
-        check_new(new, ", or --overwrite to replace the import; an edited scene is kept beside it")
-    prepare_folder(folder)
-    write_new(new, replaced)
+        check_new((folder / item for item in new), kept)
+    write_new(folder, new, replaced)
     click.echo(
-        f"{path}: {len(scene.bodies)} arms, {rows.shape[1]} joints that move, "
-        f"{float(t[-1]):g} s of motion"
+        f"{path}: {len(scene.bodies)} arms, {joints} joints that move, "
+        f"{scene.duration:g} s of motion"
     )
     for body in scene.bodies:
         if body.size is not None:
             sides = " x ".join(f"{item:.3g}" for item in (body.length, *body.size))
             box = "a box to edit" if body.measured else "a box of guessed height and thickness"
-            what = box if body.mesh is None else f"its shape, {body.mesh.cells} cells"
+            what = box if body.mesh is None else f"its shape, {len(body.mesh.cells)} cells"
             click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}; {scene.masses(body)}")
             if body.mesh is not None and body.mesh.done:
                 click.echo(f"{scene.arms[body.link]}: {'; '.join(body.mesh.done)}")
@@ -163,11 +144,7 @@ def _keep_edited(path: Path, text: str | bytes) -> None:
 
 
 # Options that each format takes besides --out and --overwrite.
-FORMATS = {
-    "bodies": ("design", "set"),
-    "robot": ("before",),
-    "state-space": ("design", "set", "at", "below"),
-}
+FORMATS = {"bodies": ("design", "set"), "robot": (), "state-space": ("design", "set", "below")}
 
 
 @click.command()
@@ -178,8 +155,6 @@ FORMATS = {
 @out_option("the files; default: results/SCENE-WHAT, or urdf or state-space in the folder of a run")
 @overwrite_option
 @set_option
-@old_option("--at", now="export SCENE state-space T", type=float)
-@old_option("--before", now="export RUN robot BEFORE", type=PATH)
 @click.option(
     "--below",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -187,18 +162,15 @@ FORMATS = {
     help="of state-space: take as many coordinates as poles below this frequency need to be within "
     "1 %; default: those of the scene",
 )
-@old_option("--urdf", now="export RUN robot", is_flag=True)
-@old_option("--state-space", "instant", now="export SCENE state-space T", type=float)
 def export(
     scene: Path,
     kind: str,
     last: str | None,
+    design: Path | None,
     out: Path | None,
     overwrite: bool,
     overrides: tuple[str, ...],
-    urdf: bool,
-    instant: float | None,
-    **given: Any,
+    below: float | None,
 ) -> None:
     """Write what other programs need of SCENE. WHAT is one of
 
@@ -214,30 +186,24 @@ def export(
     geometric stiffness where simulation.stiffening is true, or "auto" and the motion asks for it.
     With [[joints]] in space; of rigid arms mass, centre and inertia are printed.
     """
-    if urdf or instant is not None:
-        kind = "robot" if urdf else "state-space"
-        given["at"] = instant if given["at"] is None else given["at"]
-    given["set"] = overrides
-    if last is not None:
-        given |= _last_word(kind, last)
-    for name, value in given.items():
+    for name, value in (("design", design), ("set", overrides), ("below", below)):
         if value not in (None, ()) and name not in FORMATS[kind]:
             users = " or ".join(word for word, options in FORMATS.items() if name in options)
             raise InputError(f"--{name}: expected with {users}, not with {kind}")
-    design, at, is_run = given["design"], given["at"], scene.is_dir()
+    is_run = scene.is_dir()
     if kind == "bodies" and is_run:
         raise InputError(f"{scene}: a folder; name a scene file, or add robot or state-space")
-    if kind == "state-space" and at is None:
-        raise InputError(
-            "state-space: expected an instant, s, behind it: export SCENE state-space T"
-        )
+    if kind == "bodies" and last is not None:
+        raise InputError(f"{last}: expected nothing behind {kind}")
+    at = _instant(last) if kind == "state-space" else 0.0
     if is_run and design is not None:
         raise InputError("--design: expected none with the folder of a run, which has its own")
     world, loaded = _machine(scene, overrides, is_run or kind == "robot")
     from dolfinopt.cli import export as work  # with what needs MPI
 
     if kind == "robot":
-        work.export_robot(world, loaded, scene, out, overwrite, given["before"])
+        before = None if last is None else Path(last)
+        work.export_robot(world, loaded, scene, out, overwrite, before)
         return
     folder = out or Path("results") / f"{scene.stem}-{kind}"
     if kind == "bodies":
@@ -245,7 +211,18 @@ def export(
         return
     if is_run:
         design, folder = scene / "design.npz", out or scene / kind
-    work.export_state_space(world, loaded, folder, overwrite, design, at, given["below"])
+    work.export_state_space(world, loaded, folder, overwrite, design, at, below)
+
+
+def _instant(word: str | None) -> float:
+    """Return the instant, s, that stands behind state-space."""
+    try:
+        return float(word or "")
+    except ValueError:
+        raise InputError(
+            f"state-space: expected an instant, s, behind it, found {word or 'nothing'}: "
+            "export SCENE state-space T"
+        ) from None
 
 
 def _machine(source: Path, overrides: tuple[str, ...], is_run: bool) -> tuple[MPI.Comm, Scene]:
@@ -258,15 +235,3 @@ def _machine(source: Path, overrides: tuple[str, ...], is_run: bool) -> tuple[MP
     from dolfinopt.parallel import on_root
 
     return world, on_root(world, scene_of, source)
-
-
-def _last_word(kind: str, word: str) -> dict[str, Any]:
-    """Return the value, by its name, that stands behind a format."""
-    if kind == "robot":
-        return {"before": Path(word)}
-    if kind == "bodies":
-        raise InputError(f"{word}: expected nothing behind {kind}")
-    try:
-        return {"at": float(word)}
-    except ValueError:
-        raise InputError(f"{word}: expected an instant, s, behind {kind}") from None

@@ -27,9 +27,9 @@ from dolfinopt.exchange.urdf.scene import Origin, read_origin
 from dolfinopt.interrupt import ending_at_once
 from dolfinopt.loading import load_scene
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.output.design import arms_with_design, gather_views, under_law_of
+from dolfinopt.output.design import Designed, arms_with_design, gather_views, under_law_of
 from dolfinopt.output.folders import PARTS, prepare_folder, remove_stale, stale_parts
-from dolfinopt.parallel import Partition, gather_arms, on_root, together
+from dolfinopt.parallel import gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import decide_stiffening
 from dolfinopt.responses.linearised_machine import linearised_machine
@@ -49,9 +49,10 @@ def export_bodies(
     """Write the reduced arms of a scene."""
     names = [f"{arm.name}{kind}" for arm in scene.arms for kind in KINDS]
     claim(world, folder, overwrite, names, scene=scene)
-    partition, arms, x_phys = arms_with_design(world, scene, design, Profile())
+    place = arms_with_design(world, scene, design, Profile())
+    _, partition, arms, x_phys = place
     prepare(world, folder)
-    tell(world, choose_coordinates(scene, partition, arms, x_phys, Profile()))
+    tell(world, choose_coordinates(*place, Profile()))
     with together(world):
         for k, arm in arms.items():
             arm.state(x_phys[k])
@@ -92,9 +93,9 @@ def export_state_space(
     claim(world, folder, overwrite, STATE_SPACE, scene=scene)
     profile = Profile()
     scene = on_root(world, under_law_of, scene, design)
-    partition, arms, x_phys = arms_with_design(world, scene, design, profile)
-    tell(world, choose_coordinates(scene, partition, arms, x_phys, profile))
-    model = linearised_machine(scene, partition, arms, x_phys, at, profile, below=below)
+    place = arms_with_design(world, scene, design, profile)
+    tell(world, choose_coordinates(*place, profile))
+    model = linearised_machine(*place, at, profile, below=below)
     prepare(world, folder)
     with together(world):
         if world.rank == 0:
@@ -172,15 +173,10 @@ PAGES = ("before_after.md", "before_after.csv", "before_after.html")
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """A finished run: its scene, and the arms as its design makes them."""
+    """A finished run, and the arms as its design makes them."""
 
-    # folder, scene: of the run
     folder: Path
-    scene: Scene
-    # partition, arms, x_phys: its design, on this rank
-    partition: Partition
-    arms: Mapping[int, Arm]
-    x_phys: Mapping[int, np.ndarray]
+    design: Designed
     # of all arms with a design of their own, reduced; on the root
     bodies: Mapping[int, ShapeIntegrals]
 
@@ -244,16 +240,16 @@ def _links(world: MPI.Comm, run: _Run) -> _Links:
     from dolfinopt.part.folder import SCENE
     from dolfinopt.part.part import make_parts
 
-    folder = run.folder / PARTS
+    folder, scene = run.folder / PARTS, run.design.scene
     if not on_root(world, lambda: (folder / SCENE).is_file() and not stale_parts(folder)):
-        parts = make_parts(run.scene, run.folder, world=world)
-        owners = dict(zip((arm.name for arm in run.scene.arms), run.scene.owners, strict=True))
+        parts = make_parts(scene, run.folder, world=world)
+        owners = dict(zip((arm.name for arm in scene.arms), scene.owners, strict=True))
         return {name: (run.bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
     machine: Scene = on_root(world, load_scene, folder / SCENE)
     bodies = _reduced(world, folder, machine, None).bodies
     if world.rank:
         return {}
-    files = {item.name: folder / f"{_owner(run.scene, item.name)}.stl" for item in machine.arms}
+    files = {item.name: folder / f"{_owner(scene, item.name)}.stl" for item in machine.arms}
     return {
         item.name: (bodies[k], _surface(files[item.name]))
         for k, item in enumerate(machine.arms)
@@ -278,11 +274,10 @@ def _surface(file: Path) -> np.ndarray:
 def _reduced(world: MPI.Comm, run: Path, scene: Scene, design: str | None = "design.npz") -> _Run:
     """Return a finished run's arms, reduced (collective); without a design solid ones."""
     densities = None if design is None else run / design
-    partition, arms, x_phys = arms_with_design(world, scene, densities, Profile())
+    place = arms_with_design(world, scene, densities, Profile())
     with together(world):
-        mine = {k: arm.reduce(x_phys[k]) for k, arm in arms.items()}
-    own = {k: x_phys[k] for k in arms}
-    return _Run(run, scene, partition, arms, own, gather_arms(partition, mine))
+        mine = {k: arm.reduce(place.x_phys[k]) for k, arm in place.arms.items()}
+    return _Run(run, place, gather_arms(place.partition, mine))
 
 
 def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
@@ -303,10 +298,10 @@ def _sides(world: MPI.Comm, before: Path, after: _Run) -> list[Any]:
 
     sides = []
     for item in (_reduced(world, before, on_root(world, scene_of, before)), after):
-        views = gather_views(item.scene, item.partition, item.arms, item.x_phys)
+        views = gather_views(*item.design)
         with together(world):
             if world.rank == 0:
-                sides.append(read_side(item.folder, item.scene, views, item.bodies))
+                sides.append(read_side(item.folder, item.design.scene, views, item.bodies))
     return sides
 
 

@@ -11,6 +11,7 @@ import textwrap
 from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from fnmatch import fnmatchcase
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +20,17 @@ import click
 from dolfinopt.cli.exchange import export, import_robot
 from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.shared import PATH, Start, end_before_start, old_option
-from dolfinopt.cli.studies import bench, compare, reproduce, sweep, uncertainty
+from dolfinopt.cli.shared import PATH, Start, end_before_start, warn
+from dolfinopt.cli.studies import (
+    CHECK,
+    COARSE,
+    FITTED,
+    bench,
+    compare,
+    reproduce,
+    sweep,
+    uncertainty,
+)
 from dolfinopt.data import template_folder
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import launched_rank
@@ -47,7 +57,7 @@ TEMPLATES = {
 )
 @click.argument("name", default="scene", type=PATH)
 @click.argument("template", type=click.Choice(list(TEMPLATES)), default="two-arm")
-@old_option("--template", "older", now="init NAME TEMPLATE", type=click.Choice(list(TEMPLATES)))
+@click.option("--template", "older", hidden=True, type=click.Choice(list(TEMPLATES)))
 def init(name: Path, template: str, older: str | None) -> None:
     if launched_rank():  # the root does it
         return
@@ -66,10 +76,10 @@ def init(name: Path, template: str, older: str | None) -> None:
         text = source.read_text(encoding="utf-8")
         for mark, value in (("@NAME@", title), ("@STEM@", path.stem)):
             text = text.replace(f'"{mark}', '"' + json.dumps(value, ensure_ascii=False)[1:-1])
-        texts[path.with_suffix(source.suffix)] = text
+        texts[path.with_suffix(source.suffix).name] = text
     schema = path.with_name(SCHEMA_FILE)
-    write_new(texts, {schema: json.dumps(scene_schema(), indent=2) + "\n"})
-    written = ", ".join(os.fspath(item) for item in texts)
+    write_new(path.parent, texts, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"})
+    written = ", ".join(os.fspath(path.with_name(name)) for name in texts)
     click.echo(f"{written}: edit the values that differ for your machine")
     click.echo(f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)")
     if template == "step":
@@ -228,6 +238,39 @@ GROUPS = {
 }
 
 
+# Options of older command lines: the words behind the command that have taken their place, in the
+# order in which they stand there.
+OLDER: dict[str, dict[str, tuple[str, ...]]] = {
+    "bench": {"--quick": ("quick",), "--records": ("ur10e={}",)},
+    "compare": {"--only": ("{}",)},
+    "export": {
+        "--urdf": ("robot",),
+        "--state-space": ("state-space", "{}"),
+        "--before": ("{}",),
+        "--at": ("{}",),
+    },
+    "import": {"--trajectory": ("{}",), "--links": ("{}",)},
+    "reproduce": {"--coarse": (COARSE,), "--fitted": (FITTED,), "--check": (CHECK,)},
+}
+
+
+def in_new_words(command: str, words: list[str]) -> list[str]:
+    """Return a command line in the words of now, and tell which are older."""
+    older, kept, rest = OLDER.get(command, {}), list[str](), iter(words)
+    new: dict[str, list[str]] = {option: [] for option in older}
+    for word in rest:
+        option, stated, value = word.partition("=")
+        if option not in older:
+            kept.append(word)
+            continue
+        if "{}" in older[option][-1] and not stated:
+            value = next(rest, "")
+        new[option] += [part.format(value) for part in older[option]]
+        if not launched_rank():
+            warn([f"{option} is an older option: dolfinopt {command} ... {' '.join(new[option])}"])
+    return [*kept, *chain.from_iterable(new.values())]
+
+
 class _Commands(click.Group):
     """A group whose help is printed by the root alone, and that knows what a wrong word meant."""
 
@@ -252,7 +295,8 @@ class _Commands(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Say which command an unknown one resembles."""
         try:
-            return super().resolve_command(ctx, args)
+            name, command, words = super().resolve_command(ctx, args)
+            return name, command, in_new_words(str(name), words)
         except click.UsageError as error:
             near = difflib.get_close_matches(args[0], self.list_commands(ctx), 1)
             if not near or "mean" in error.message:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from dolfinopt.cli.shared import (
     PATH,
-    animation_option,
     claim,
     design_option,
     draw,
@@ -38,10 +37,9 @@ from dolfinopt.progress import with_unit
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.arms.arm import Arm
     from dolfinopt.optimization.result import RankResult
-    from dolfinopt.output.design import ArmView
-    from dolfinopt.parallel import Partition
+    from dolfinopt.output.design import Designed
+    from dolfinopt.profiling import Profile
     from dolfinopt.scene.load import Scene
 
 
@@ -52,7 +50,6 @@ if TYPE_CHECKING:
 @overwrite_option
 @set_option
 @plots_option
-@click.option("--animation", is_flag=True, hidden=True)  # dolfinopt plot DIR --animation
 @verbose_option
 def optimize(
     scene: Path,
@@ -61,7 +58,6 @@ def optimize(
     overwrite: bool,
     overrides: tuple[str, ...],
     plots: bool,
-    animation: bool,
     verbose: bool,
 ) -> None:
     """Optimise the arms of SCENE for the loads of their motion."""
@@ -95,7 +91,7 @@ def optimize(
                     report=lambda row: say(in_words(row, most)),
                     compared=True,
                 )
-            _conclude(folder, result, plots, animation, verbose)
+            _conclude(folder, result, plots, verbose)
         except KeyboardInterrupt:
             instead = " in place of --overwrite" if overwrite else ""
             raise KeyboardInterrupt(f"to go on, add --resume{instead}") from None
@@ -119,22 +115,15 @@ def _tell_ahead(world: MPI.Comm, scene: Scene) -> None:
                 click.echo(line)
 
 
-def _conclude(
-    folder: Path, result: RankResult, plots: bool, animation: bool, verbose: bool
-) -> None:
+def _conclude(folder: Path, result: RankResult, plots: bool, verbose: bool) -> None:
     """Write all that a result leaves behind, and tell of it (collective)."""
     from dolfinopt.cli.report import conclude
     from dolfinopt.output.run_folder import write_result
 
-    def pictures(place: Path, views: list[ArmView]) -> None:
-        assert result.trajectory is not None
-        history, initial = result.rows, result.initial_deviation
-        draw(place, result.scene, views, result.trajectory, history, initial, animation=animation)
-
-    drawn = pictures if plots or animation else None
-    written = write_result(folder, result, elapsed(), pictures=drawn)
-    if written is not None:
-        conclude(result, written.summary, folder, verbose)
+    pictures = partial(draw, result) if plots else None
+    summary = write_result(folder, result, elapsed(), pictures=pictures)
+    if summary is not None:
+        conclude(result, summary, folder, verbose)
 
 
 # -- `dolfinopt simulate` ------------------------------------------------------------------------
@@ -147,7 +136,6 @@ def _conclude(
 @overwrite_option
 @set_option
 @plots_option
-@click.option("--animation", is_flag=True, hidden=True)
 @verbose_option
 def simulate(
     scene: Path,
@@ -156,7 +144,6 @@ def simulate(
     overwrite: bool,
     overrides: tuple[str, ...],
     plots: bool,
-    animation: bool,
     verbose: bool,
 ) -> None:
     """Simulate SCENE with a given design.
@@ -166,25 +153,20 @@ def simulate(
     world, loaded = load(scene, overrides)
     tell_assumed(world, loaded)
     folder = out or Path("results") / f"{scene.stem}-simulation"
-    from dolfinopt.optimization.result import simulation_result
     from dolfinopt.output.design import arms_with_design, under_law_of
     from dolfinopt.output.folders import check_unused, remove_stale, working_alone
+    from dolfinopt.output.run_folder import simulated
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
-    from dolfinopt.responses.evaluation import evaluate
-    from dolfinopt.responses.order_selection import choose_coordinates
 
     claim(world, folder, overwrite, scene=loaded)
     profile = Profile()
     loaded = on_root(world, under_law_of, loaded, design)
-    partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
+    arms = arms_with_design(world, loaded, design, profile)
     with working_alone(world, folder, None if overwrite else partial(check_unused, folder)):
-        choice = choose_coordinates(loaded, partition, arms, x_phys, profile)
-        evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
-        place = partition, arms, x_phys
-        result = simulation_result(loaded, *place, evaluation, trajectory, profile, choice)
+        result = simulated(arms, profile)
         on_root(world, remove_stale, folder)
-        _conclude(folder, result, plots, animation, verbose)
+        _conclude(folder, result, plots, verbose)
 
 
 # -- `dolfinopt gradient` ------------------------------------------------------------------------
@@ -242,35 +224,27 @@ def gradient(
         check_exact(loaded)
     profile = Profile()
     loaded = on_root(world, under_law_of, loaded, design)
-    partition, arms, x_phys = arms_with_design(world, loaded, design, profile)
+    place = arms_with_design(world, loaded, design, profile)
     prepare(world, out.parent)
-    moves = needs(loaded, "motion")
-    if moves:
-        tell(world, choose_coordinates(loaded, partition, arms, x_phys, profile))
-    evaluation, trajectory = evaluate(loaded, partition, arms, x_phys, profile, simulated=False)
-    by_cell = slopes(loaded, partition, arms, trajectory, profile)
-    write_gradient(out, loaded, partition, arms, by_cell, evaluation.objective)
+    if needs(loaded, "motion"):
+        tell(world, choose_coordinates(*place, profile))
+    evaluation, trajectory = evaluate(*place, profile, simulated=False)
+    by_cell = slopes(*place[:3], trajectory, profile)
+    write_gradient(out, *place[:3], by_cell, evaluation.objective)
     if world.rank == 0:
         unit = loaded.objective.response.unit
         name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
         value = with_unit(f"{evaluation.objective:.6g}", unit)
         click.echo(f"objective {value}; {name} gradient in {out}")
     if check:
-        _check_gradient(world, loaded, partition, arms, x_phys, profile)
+        _check_gradient(world, place, profile)
 
 
-def _check_gradient(
-    world: MPI.Comm,
-    scene: Scene,
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x: Mapping[int, Any],
-    profile: Any,
-) -> None:
+def _check_gradient(world: MPI.Comm, place: Designed, profile: Profile) -> None:
     """Print the Taylor test; raise ConvergenceError where a rate is too low."""
     from dolfinopt.optimization.gradient_check import STEPS, taylor_test
 
-    test = taylor_test(scene, partition, arms, x, profile)
+    test = taylor_test(*place, profile)
     if world.rank == 0:
         steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
         click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")
@@ -278,7 +252,7 @@ def _check_gradient(
             remainders = "".join(f"{r:12.2e}" for r in row.remainders)
             slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
             click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
-        if scene.objective.has_esl_gradient:
+        if place.scene.objective.has_esl_gradient:
             click.echo(
                 f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
                 f"{test.ratio:.3f} times as long"
@@ -296,26 +270,25 @@ def _check_gradient(
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=PATH)
-@animation_option
+@click.option("--animation", is_flag=True, help="also draw the moving machine: motion.gif")
 def plot(folder: Path, animation: bool) -> None:
     """Redraw the pictures of a finished run in DIR."""
     world = start()
-    from dolfinopt.output.design import arms_with_design, gather_views, read_history
+    from dolfinopt.output.design import arms_with_design, read_history
+    from dolfinopt.output.run_folder import simulated, views_of
     from dolfinopt.output.trajectory import read_initial_deviation
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
-    from dolfinopt.responses.evaluation import evaluate
-    from dolfinopt.responses.stress_report import stress_report
 
-    loaded = on_root(world, scene_of, folder)
-    profile = Profile()
-    partition, arms, x_phys = arms_with_design(world, loaded, folder / "design.npz", profile)
-    _, trajectory = evaluate(loaded, partition, arms, x_phys, profile)
-    stress = stress_report(partition, arms, trajectory, profile)
-    views = gather_views(loaded, partition, arms, x_phys, stress)
-    if trajectory is None:
+    loaded, profile = on_root(world, scene_of, folder), Profile()
+    arms = arms_with_design(world, loaded, folder / "design.npz", profile)
+    result = simulated(arms, profile)
+    views, _ = views_of(result)
+    if result.trajectory is None:
         return
-    history = read_history(folder / "history.csv") if (folder / "history.csv").exists() else []
-    initial = read_initial_deviation(folder / "trajectory.npz", trajectory.t)
-    draw(folder, loaded, views, trajectory, history, initial, animation=animation)
+    history = folder / "history.csv"
+    rows = read_history(history) if history.exists() else []
+    initial = read_initial_deviation(folder / "trajectory.npz", result.trajectory.t)
+    result = replace(result, rows=rows, initial_deviation=initial)
+    draw(result, folder, views, animation=animation)
     click.echo(f"pictures in {folder}")

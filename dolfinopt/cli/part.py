@@ -103,7 +103,7 @@ def part(
     world = start()
     from dolfinopt.parallel import on_root, together
     from dolfinopt.part.folder import SHAPES, checkpoint_of_search, file_names
-    from dolfinopt.part.part import Curves, PartsError, make_parts
+    from dolfinopt.part.part import Curves, make_parts
 
     if resume and overwrite:
         raise InputError("--resume, --overwrite: expected only one of them")
@@ -126,15 +126,7 @@ def part(
     with progress(world) as say:
         say("outlines and surfaces")
         wanted = Curves(asked.tool_radius, asked.tolerance, rounds)
-        try:
-            parts = make_parts(scene, folder, wanted, world)
-        except PartsError as error:  # what there is of the others is of use
-            if error.parts:
-                say("files")
-                PartsJob(scene, error.parts, None).write(folder, target, plots)
-                names = ", ".join(item.name for item in error.parts.values())
-                warn([f"only files of {names} in {target}"])
-            raise
+        parts = make_parts(scene, folder, wanted, world)
         with together(world):
             if world.rank == 0:
                 warn(dict.fromkeys(text for item in parts.values() for text in item.warnings))

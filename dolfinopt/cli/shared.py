@@ -38,7 +38,7 @@ from dolfinopt.output.folders import (
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.dynamics.build import Trajectory
+    from dolfinopt.optimization.result import Result
     from dolfinopt.optimization.state import HistoryRow
     from dolfinopt.output.design import ArmView
     from dolfinopt.responses.order_selection import OrderSelection
@@ -144,16 +144,7 @@ def _instead(folder: Path) -> str:
     return "name the folder of a finished optimize or simulate run"
 
 
-def draw(
-    folder: Path,
-    scene: Scene,
-    views: list[ArmView],
-    trajectory: Trajectory,
-    history: list[HistoryRow],
-    initial: Any,
-    *,
-    animation: bool = False,
-) -> None:
+def draw(result: Result, folder: Path, views: list[ArmView], *, animation: bool = False) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.output.design import designed
     from dolfinopt.plots.curves import (
@@ -167,6 +158,8 @@ def draw(
     from dolfinopt.plots.machine import draw_motion, machine_figure, make_film
     from dolfinopt.plots.style import save
 
+    scene, trajectory, history = result.scene, result.trajectory, result.rows
+    assert trajectory is not None
     title, bodies = scene.name, trajectory.mechanism.arms
     if arms := designed(views):
         masses = {view.name: body.mass for view, body in zip(views, bodies, strict=True)}
@@ -179,7 +172,7 @@ def draw(
         if (limits := limits_figure(scene, history)) is not None:
             save(limits, folder / "limits.png")
     if not scene.is_pinned:
-        save(deviation_of(trajectory, initial), folder / "deviation.png")
+        save(deviation_of(trajectory, result.initial_deviation), folder / "deviation.png")
     if trajectory.is_machine:
         save(drives_figure(trajectory), folder / "drives.png")
     if scene.motion.coefficients:
@@ -261,23 +254,7 @@ verbose_option = click.option(
 )
 
 
-animation_option = click.option(
-    "--animation", is_flag=True, help="also draw the moving machine: motion.gif"
-)
-
-
 overwrite_option = click.option("--overwrite", is_flag=True, help="replace existing results")
-
-
-def old_option(*names: str, now: str, **settings: Any) -> Callable[..., Any]:
-    """Return an option of older command lines: it is read, and what stands for it now is told."""
-
-    def tell_now(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
-        if value not in (None, (), False, ""):
-            warn([f"{names[0]} is an older option: {now}"])
-        return value
-
-    return click.option(*names, hidden=True, help=now, callback=tell_now, **settings)
 
 
 def out_option(what: str) -> Callable[..., Any]:

@@ -14,7 +14,6 @@ import click
 from dolfinopt.cli.shared import (
     PATH,
     load,
-    old_option,
     out_option,
     overwrite_option,
     plots_option,
@@ -38,7 +37,8 @@ PRESETS = ("payload", "flattening", "coordinates")
 # Preset by the command's word; members of uniform section are a study of their own.
 COMPARED = {"objectives": "objective", "reductions": "reduction"}
 SECTIONS, MOTIONS = "sections", "motions"
-COARSE, FITTED = "coarse", "fitted"  # variants of the paper's scene
+# Variants of the paper's scene; and to demand its main statements of these, too.
+COARSE, FITTED, CHECK = "coarse", "fitted", "check"
 
 designs_option = click.option(
     "--design",
@@ -185,7 +185,6 @@ def sweep(
 @scene_argument
 @click.argument("what", type=click.Choice([*COMPARED, SECTIONS, MOTIONS]))
 @click.argument("kinds", nargs=-1, metavar="[KIND...]")
-@old_option("--only", now="compare SCENE WHAT KIND...", multiple=True)
 @click.option(
     "--design",
     "designs",
@@ -199,7 +198,6 @@ def compare(
     scene: Scene,
     what: str,
     kinds: tuple[str, ...],
-    only: tuple[str, ...],
     designs: tuple[Path, ...],
 ) -> Question:
     """Optimise SCENE for every objective or with every reduction, and compare the designs.
@@ -212,7 +210,6 @@ def compare(
     What is computed is kept in DIR and taken from there the next time; a call that was
     interrupted goes on.
     """
-    kinds += only
     if kinds and what in (SECTIONS, MOTIONS):
         raise InputError(f"{kinds[0]}: expected nothing behind compare SCENE {what}")
     if what == SECTIONS:
@@ -261,19 +258,13 @@ def uncertainty(
 
 
 @click.command()
-@click.argument("variants", nargs=-1, type=click.Choice([COARSE, FITTED]))
+@click.argument("variants", nargs=-1, type=click.Choice([COARSE, FITTED, CHECK]))
 @out_option("figures, report.html and cases; default: results/paper, or paper-fitted")
-@old_option("--check", now="reproduce always checks the paper's own scene", is_flag=True)
-@old_option("--coarse", now="reproduce coarse", is_flag=True)
-@old_option("--fitted", now="reproduce fitted", is_flag=True)
 @set_option
 @plots_option
 def reproduce(
     variants: tuple[str, ...],
     out: Path | None,
-    check: bool,
-    coarse: bool,
-    fitted: bool,
     overrides: tuple[str, ...],
     plots: bool,
 ) -> None:
@@ -281,7 +272,7 @@ def reproduce(
 
     The exit status is 1 if one of the main statements does not hold. Variants: "coarse" takes
     100 x 6 cells, a filter of two of them and 60 iterations, a minute; "fitted" fits the values
-    that the paper does not state to its statements. Their exit status is 0.
+    that the paper does not state to its statements. Their exit status is 0 without "check".
 
     What is computed is kept in DIR/cases and taken from there the next time; a call that was
     interrupted goes on.
@@ -292,7 +283,7 @@ def reproduce(
     from dolfinopt.paper.reproduction import check_paper, failed_checks
     from dolfinopt.parallel import on_root
 
-    coarse, fitted = coarse or COARSE in variants, fitted or FITTED in variants
+    coarse, fitted = COARSE in variants, FITTED in variants
     folder = out or Path("results") / ("paper-fitted" if fitted else "paper")
     overrides = (*(paper.FITTED if fitted else ()), *overrides)
     scene = on_root(world, paper.load_paper, coarse, overrides)
@@ -312,7 +303,10 @@ def reproduce(
 
     on_root(world, conclude)  # a rank that raised below meanwhile would end the root at its writing
     failures = [f"{o.case.label}: {o.failure}" for o in outcomes.failures]
-    wrong = [*failures, *(failed_checks(checks) if check or not (coarse or overrides) else ())]
+    wrong = [
+        *failures,
+        *(failed_checks(checks) if CHECK in variants or not (coarse or overrides) else ()),
+    ]
     if wrong:
         raise ConvergenceError("; ".join(wrong))
 
@@ -323,14 +317,7 @@ FIELD, QUICK = "field", "quick"
 @click.command()
 @click.argument("names", metavar="[quick] [DIAGRAM... | field [CASE...]]", nargs=-1)
 @out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
-@old_option("--quick", now="bench quick", is_flag=True)
-@old_option("--records", now="bench field CASE=DIR", type=PATH)
-def bench(
-    names: tuple[str, ...],
-    out: Path | None,
-    quick: bool,
-    records: Path | None,
-) -> None:
+def bench(names: tuple[str, ...], out: Path | None) -> None:
     """Measure run time against error, or check the benchmark of the field.
 
     Diagrams of integrators, iterations, elements and errors, beside other programs; or those named
@@ -345,21 +332,18 @@ def bench(
     missed. By default the quick cases, some ten seconds; those named alone; "all" with the long
     ones; with CASE=DIR one that reads measured records which cannot be copied: ur10e.
     """
-    world = start()
-    if QUICK in names:
-        names, quick = tuple(name for name in names if name != QUICK), True
+    world, quick = start(), QUICK in names
+    names = tuple(name for name in names if name != QUICK)
     if names[:1] == (FIELD,):
         if quick:
             raise InputError("bench field: quick does not go with it")
         measured = dict(name.split("=", 1) for name in names[1:] if "=" in name)
-        records = next(map(Path, measured.values()), records)
+        records = next(map(Path, measured.values()), None)
         cases = tuple(name for name in names[1:] if "=" not in name)
         _check_field(world, out, cases if cases == ("all",) else (*cases, *measured), records)
         return
     if world.size > 1:
         raise InputError("bench: starts its ranks itself; call it without mpirun")
-    if records:
-        raise InputError("bench: measured records belong to dolfinopt bench field")
     _measure(names, out, quick)
 
 

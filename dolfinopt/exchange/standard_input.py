@@ -25,7 +25,7 @@ the link, for zero as far as the rest of the file allows it: exact in the limit 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -365,14 +365,16 @@ def from_sid(
             of the plane, initial stresses, geometric stiffening by some loads only, no matrices of
             the first order in Oe of a body in space, matrices that are no mechanical body's.
     """
-    first, last = _ends(data, source)
-    tips = [last, *(_named(data, name, source) for name in further)]
-    _check_nodes(first, tips, dimension, source)
-    _check_body(data, dimension, source)
+    _refuse(_unlike_arms(data, further), source)
+    by_name = {node.name.casefold(): node for node in data.nodes}
+    tips = [data.nodes[-1], *(by_name[name.casefold()] for name in further)]
+    _refuse(_misplaced(data.nodes[0], tips, dimension), source)
+    _refuse(_impossible(data, dimension), source)
+    _refuse(_half_stiffened(data, tips, dimension), source)
     q, along, about = data.num_modes, *_axes(dimension)
     K0, K0_outboard = np.zeros((0, q, q)), np.zeros((0, q, q))
     moments = _plane_moments if dimension == 2 else _spatial_moments
-    W, rotation = moments(data, _is_stiffened(data, tips, dimension, source))
+    W, rotation = moments(data, bool(_first_order(data.Ct)[:, :, along].any()))
     if len(rotation):
         push = -data.Ct.M1.transpose(2, 0, 1)[along]
         own = [
@@ -383,7 +385,7 @@ def from_sid(
         K0, K0_outboard = np.concatenate([push, rotation]), np.concatenate(own)
         names = ", ".join(tip.name for tip in tips)
         loads = {"Ct": push, f"phi, psi of node {names}": K0_outboard}
-        _check_symmetric(loads, source)
+        _refuse(_asymmetric(loads), source)
     points = np.stack([tip.origin.M0[along, 0] for tip in tips])
     modes = [rows for tip in tips for rows in (tip.phi.M0[along], tip.psi.M0[about])]
     return ShapeIntegrals(
@@ -471,40 +473,40 @@ def _centrifugal_excess(data: sid.StandardInputData, dimension: int) -> np.ndarr
     return np.asarray(data.Me.M0 + 0.5 * data.Oe.M1[:, :, :3].sum(axis=-1))
 
 
-# -- what standard input data must fulfil ------------------------------------------------------
+# -- what standard input data must fulfil: a sentence for everything that it does not --------------
 
 
-def _ends(data: sid.StandardInputData, source: str) -> tuple[sid.Node, sid.Node]:
-    """Return the two interface nodes of a body that bends: the first and the last."""
+def _refuse(faults: Iterable[str], source: str) -> None:
+    """Raise InputError for the first of the faults."""
+    for fault in faults:
+        raise InputError(f"{source}: {fault}")
+
+
+def _unlike_arms(data: sid.StandardInputData, further: Sequence[str]) -> Iterator[str]:
+    """Yield why a body is none that bends between an inboard and an outboard node."""
     if data.num_modes == 0:
-        raise InputError(
-            f"{source}: nelastq = 0, a body that does not bend; state rigid = true, mass and "
-            "inertia in place of the file"
+        yield (
+            "nelastq = 0, a body that does not bend; state rigid = true, mass and inertia in "
+            "place of the file"
         )
     names = [node.name for node in data.nodes]
     if len(names) < 2:
-        raise InputError(
-            f"{source}: lacks an outboard node, its nodes are: {', '.join(names) or 'none'}; an "
-            "arm needs an inboard node at the origin and an outboard node"
+        yield (
+            f"lacks an outboard node, its nodes are: {', '.join(names) or 'none'}; an arm needs "
+            "an inboard node at the origin and an outboard node"
         )
-    return data.nodes[0], data.nodes[-1]
+    known = {name.casefold() for name in names}
+    for name in further:
+        if name.casefold() not in known:
+            yield f"no node {name!r}; it has {', '.join(names)}"
 
 
-def _named(data: sid.StandardInputData, name: str, source: str) -> sid.Node:
-    """Return the node of that name."""
-    for node in data.nodes:
-        if node.name.casefold() == name.casefold():
-            return node
-    names = ", ".join(node.name for node in data.nodes)
-    raise InputError(f"{source}: no node {name!r}; it has {names}")
-
-
-def _check_nodes(first: sid.Node, tips: Sequence[sid.Node], dimension: int, source: str) -> None:
-    """Check that the frame is held at the first node, and that the others are parallel to it."""
+def _misplaced(first: sid.Node, tips: Sequence[sid.Node], dimension: int) -> Iterator[str]:
+    """Yield where the frame is not held at the first node, or the others not parallel to it."""
     last = tips[0]
-    if not np.abs(last.origin.M0).max() > 0.0:
-        raise InputError(f"{source}: the outboard node {last.name} is at the origin")
     length = np.abs(last.origin.M0).max()
+    if not length > 0.0:
+        yield f"the outboard node {last.name} is at the origin"
     push, turn = np.abs(last.phi.M0).max(), np.abs(last.psi.M0).max()
     # Of the two scales the other follows over the arm's length.
     push, turn = max(push, length * turn), max(turn, push / length)
@@ -521,82 +523,72 @@ def _check_nodes(first: sid.Node, tips: Sequence[sid.Node], dimension: int, sour
         ]
     checks += [(node, "AP", node.AP.M0 - ONE, 1.0, "parallel") for node in (first, *tips)]
     for node, name, values, scale, must in checks:
-        if np.abs(values).max() > FILE_ROUNDING_SHARE * scale:
-            raise InputError(
-                f"{source}: {name} of node {node.name} deviates by {np.abs(values).max():.3g}; the "
+        if (off := np.abs(values).max()) > FILE_ROUNDING_SHARE * scale:
+            yield (
+                f"{name} of node {node.name} deviates by {off:.3g}; the "
                 f"{'inboard' if node is first else 'outboard'} node must be {must}"
             )
 
 
-def _check_body(data: sid.StandardInputData, dimension: int, source: str) -> None:
-    """Check what any mechanical body fulfils, and that nothing is left out."""
+def _impossible(data: sid.StandardInputData, dimension: int) -> Iterator[str]:
+    """Yield what no mechanical body has, and what would be left out."""
     inertia = data.inertia(np.zeros(data.num_modes))
     coriolis = data.Ge.M0.reshape(data.num_modes, -1, 3)
     if dimension == 2:
-        _check_plane(data, inertia, source)
+        yield from _out_of_plane(data, inertia)
         moment, coriolis = {"J(3, 3)": inertia[2, 2]}, coriolis[:, :, 2:]
     else:
         principal = np.linalg.eigvalsh(inertia)
         # 0 of a thin bar about its axis.
         if principal[0] < -FILE_ROUNDING_SHARE * np.abs(principal).max():
-            raise InputError(
-                f"{source}: J has a moment of {principal[0]:g} kg m2; none can be negative"
-            )
+            yield f"J has a moment of {principal[0]:g} kg m2; none can be negative"
         moment = {"the largest moment of J": principal[-1]}
-    _check_definite(data, {"mass": data.mass} | moment, source)
+    for name, number in ({"mass": data.mass} | moment).items():
+        if not number > 0.0:
+            yield f"{name} = {number:g} must be > 0"
+    for name, matrix in (("Me", data.Me.M0), ("Ke", data.Ke.M0)):
+        if np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] <= 0.0:
+            yield (
+                f"{name} must be positive definite; the body must be held at its inboard node "
+                "and its coordinates be independent"
+            )
     for name, values in (("ksigma", data.ksigma.M0), ("m1 of Ke", data.Ke.M1)):
         if values.any():
-            raise InputError(
-                f"{source}: {name} holds initial stresses or a stiffness that is not constant, "
-                "which arms do not have here; write the file without"
+            yield (
+                f"{name} holds initial stresses or a stiffness that is not constant, which arms "
+                "do not have here; write the file without"
             )
     if dimension == 3 and data.Oe.order == 0:
-        raise InputError(
-            f"{source}: Oe has no m1, by which deflections feel the rotation of the frame; write "
-            "the file with matrices of order 1"
+        yield (
+            "Oe has no m1, by which deflections feel the rotation of the frame; write the file "
+            "with matrices of order 1"
         )
     least = 2.0 * FILE_ROUNDING_SHARE * np.abs(data.Me.M0).max()
     if np.abs(coriolis + coriolis.swapaxes(0, 1)).max() > least:
-        raise InputError(
-            f"{source}: every third column of Ge must make a skew matrix: a block of three columns "
-            "for each coordinate, not one of all coordinates for each axis"
+        yield (
+            "every third column of Ge must make a skew matrix: a block of three columns for each "
+            "coordinate, not one of all coordinates for each axis"
         )
     if dimension == 3:
-        _check_symmetric({"Oe": data.Oe.M1.transpose(2, 0, 1)}, source)
+        yield from _asymmetric({"Oe": data.Oe.M1.transpose(2, 0, 1)})
 
 
-def _check_plane(data: sid.StandardInputData, inertia: np.ndarray, source: str) -> None:
-    """Check that plane motion stays in the plane."""
+def _out_of_plane(data: sid.StandardInputData, inertia: np.ndarray) -> Iterator[str]:
+    """Yield by what plane motion would leave the plane."""
     for name, values, matrix in (
         ("row 3 of mdCM", data.mdCM.M0[2], data.mdCM.M0),
         ("J(1, 3), J(2, 3)", inertia[:2, 2], inertia),
         ("column 3 of Ct", data.Ct.M0[:, 2], data.Ct.M0),
         ("columns 1, 2 of Cr", data.Cr.M0[:, :2], data.Cr.M0),
     ):
-        if np.abs(values).max() > FILE_ROUNDING_SHARE * np.abs(matrix).max():
-            raise InputError(
-                f"{source}: {name} reach(es) {np.abs(values).max():.3g}; an arm must move in the "
-                "x-y plane only"
-            )
+        if (most := np.abs(values).max()) > FILE_ROUNDING_SHARE * np.abs(matrix).max():
+            yield f"{name} reach(es) {most:.3g}; an arm must move in the x-y plane only"
 
 
-def _check_definite(data: sid.StandardInputData, numbers: Mapping[str, float], source: str) -> None:
-    """Check that a mechanical body may have these masses and stiffnesses; `numbers` are > 0."""
-    for name, number in numbers.items():
-        if not number > 0.0:
-            raise InputError(f"{source}: {name} = {number:g} must be > 0")
-    for name, matrix in (("Me", data.Me.M0), ("Ke", data.Ke.M0)):
-        if np.linalg.eigvalsh(0.5 * (matrix + matrix.T))[0] <= 0.0:
-            raise InputError(
-                f"{source}: {name} must be positive definite; the body must be held at its inboard "
-                "node and its coordinates be independent"
-            )
-
-
-def _is_stiffened(
-    data: sid.StandardInputData, tips: Sequence[sid.Node], dimension: int, source: str
-) -> bool:
-    """Return whether matrices hold geometric stiffness: all or none of them."""
+def _half_stiffened(
+    data: sid.StandardInputData, tips: Sequence[sid.Node], dimension: int
+) -> Iterator[str]:
+    """Yield which matrices lack the geometric stiffness that others hold."""
     # A body that its own inertia stiffens, but no load at its outboard node, or the other way
     # round, is taken for one whose file lacks matrices. In space a stubby link's rotation may do
     # little.
@@ -611,26 +603,24 @@ def _is_stiffened(
     present = [name for name in result if result[name]]
     lacking = [name for name in result if not result[name]]
     if present and lacking:
-        raise InputError(
-            f"{source}: {present[0]} holds geometric stiffening, which {lacking[0]} lacks; write "
-            "the file with that of all accelerations and of the outboard node's forces, or with "
-            "none"
+        yield (
+            f"{present[0]} holds geometric stiffening, which {lacking[0]} lacks; write the file "
+            "with that of all accelerations and of the outboard node's forces, or with none"
         )
     if rotation and not present:
-        raise InputError(
-            f"{source}: columns 1 to 3 of m1 of Oe do not add up to -2 Me: either they hold "
-            "geometric stiffness, which m1 of Ct and phi lack, or nodes have moments of inertia of "
-            "their own, which bodies do not have here"
+        yield (
+            "columns 1 to 3 of m1 of Oe do not add up to -2 Me: either they hold geometric "
+            "stiffness, which m1 of Ct and phi lack, or nodes have moments of inertia of their "
+            "own, which bodies do not have here"
         )
-    return bool(present)
 
 
-def _check_symmetric(matrices: Mapping[str, np.ndarray], source: str) -> None:
-    """Check that what one load or rotation does to the coordinates (loads, q, q) is symmetric."""
+def _asymmetric(matrices: Mapping[str, np.ndarray]) -> Iterator[str]:
+    """Yield what one load or rotation does to the coordinates (loads, q, q) without symmetry."""
     # Relative to the largest under the same name: of a load that does nothing rounding is left.
     for name, loads in matrices.items():
         if np.abs(loads - loads.swapaxes(1, 2)).max() > FILE_ROUNDING_SHARE * np.abs(loads).max():
-            raise InputError(
-                f"{source}: m1 of {name} must be symmetric in coordinates and rows or columns: "
-                "it is what one load or rotation does to the stiffness"
+            yield (
+                f"m1 of {name} must be symmetric in coordinates and rows or columns: it is what "
+                "one load or rotation does to the stiffness"
             )

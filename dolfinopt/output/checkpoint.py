@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import copyreg
 import hashlib
 import json
+import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dolfinopt.disk import write_arrays
-from dolfinopt.dynamics.collocation import Solution, Strategy
+from dolfinopt.dynamics.collocation import Strategy
 from dolfinopt.errors import InputError
-from dolfinopt.multibody.loads import Stiffening
-from dolfinopt.optimization.state import Best, HistoryRow, Memory, Progress
+from dolfinopt.optimization.state import Memory
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_cells, on_root, together
-from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import DIGEST, flattened, program, with_digests
@@ -29,13 +30,16 @@ if TYPE_CHECKING:
 
 NAME = CHECKPOINT
 SEAL = "digest"  # of all other arrays
-# Fields that the file has as JSON, which keeps every bit of a number: of `Memory`, and of its best
-# design; of a solution those that are arrays.
-PLAIN = (
-    "iteration", "change", "reach", "mma_steps", "gradient", "beta", "exact_from",
-)  # fmt: skip
-BEST = "iteration", "beta", "objective", "excess"
-SOLUTION = "time_grid", "nodes", "q", "qd", "a"
+# All that a pickled memory may name: a file from elsewhere can run nothing.
+CLASSES = {
+    "dolfinopt.optimization.state": ("Memory", "Best", "Progress", "HistoryRow"),
+    "dolfinopt.responses.order_selection": ("OrderSelection",),
+    "dolfinopt.multibody.loads": ("Stiffening",),
+    "dolfinopt.dynamics.collocation": ("Solution", "Strategy"),
+    "numpy": ("ndarray", "dtype"),
+}
+copyreg.pickle(Strategy, lambda item: (Strategy, (item.value,)))  # by its class alone
+MAKERS = "_reconstruct", "_frombuffer", "scalar"  # of NumPy's private modules
 # Keys a resumed run may change: when to stop, and how to go on from where it is.
 MAY_CHANGE = {
     *(f"optimizer.{key}" for key in ("max_iterations", "tolerance", "kkt_tolerance")),
@@ -111,7 +115,7 @@ def load(
         InputError: no checkpoint, a damaged one, or one of another scene.
     """
     arrays = on_root(partition.world, _read, folder, scene)
-    if "state" not in arrays:
+    if "memory" not in arrays:
         return None
     with together(partition.world):
         return _memory(arrays, arms)
@@ -173,25 +177,18 @@ def _difference(theirs: Any, ours: Any) -> str:
 
 def _of_run(memory: Memory) -> dict[str, np.ndarray]:
     """Return what does not belong to single arms (root only)."""
-    state: dict[str, Any] = {name: getattr(memory, name) for name in PLAIN}
-    state |= {
-        "best": {name: getattr(memory.best, name) for name in BEST},
-        "progress": asdict(memory.progress),
-        "columns": memory.history[0].columns,
-        "rows": [row.values for row in memory.history],
-        "choice": None if memory.choice is None else asdict(memory.choice),
-        "stiffening": None if memory.stiffening is None else asdict(memory.stiffening),
-        "solutions": [(item.error, item.strategy.name) for item in memory.solutions],
-    }
-    arrays = {
-        "state": np.array(json.dumps(state, default=lambda number: number.item())),
-        "multipliers": memory.multipliers,
-        "law": memory.cells[LAW],
-        "initial_deviation": memory.initial_deviation,
-    }
-    for k, solution in enumerate(memory.solutions):
-        arrays |= {f"solution{k}/{name}": getattr(solution, name) for name in SOLUTION}
-    return arrays
+    best = replace(memory.best, x=np.empty(0))
+    memory = replace(memory, cells={LAW: memory.cells[LAW]}, modes={}, best=best)
+    return {"memory": np.frombuffer(pickle.dumps(memory), np.uint8)}
+
+
+class _Unpickler(pickle.Unpickler):
+    """Reads a memory, and nothing else."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if name in CLASSES.get(module, MAKERS if module.startswith("numpy.") else ()):
+            return super().find_class(module, name)
+        raise pickle.UnpicklingError(f"{module}.{name}")
 
 
 def _of_arms(
@@ -221,34 +218,14 @@ def _of_arm(arm: Arm, index: int, memory: Memory, number: int) -> dict[str, np.n
 
 def _memory(arrays: Mapping[str, np.ndarray], arms: Mapping[int, Arm]) -> Memory:
     """Return the checkpoint's memory, cells and modes of this rank's arms."""
-    state = json.loads(str(arrays["state"]))
-    cells = {LAW: arrays["law"]}
+    memory: Memory = _Unpickler(BytesIO(arrays["memory"].tobytes())).load()
+    cells = dict(memory.cells)
     for k, arm in arms.items():
         if f"arm{k}/cells" in arrays:
             rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
             cells[k] = arrays[f"arm{k}/cells"][rows]
-    solutions = []
-    for k, (error, strategy) in enumerate(state["solutions"]):
-        parts: Any = {name: arrays[f"solution{k}/{name}"] for name in SOLUTION}
-        solutions.append(Solution(**parts, error=error, iterations=0, strategy=Strategy[strategy]))
-    progress, choice, stiffening = state["progress"], state["choice"], state["stiffening"]
-    if choice is not None:
-        choice = OrderSelection(**choice | {"tried": tuple(map(tuple, choice["tried"]))})
-    return Memory(
-        **{name: state[name] for name in PLAIN},
-        cells=cells,
-        modes={k: _modes(arrays, k, arm) for k, arm in arms.items()},
-        multipliers=arrays["multipliers"],
-        best=Best(x=np.empty(0), **state["best"]),
-        progress=Progress(
-            tuple(progress["objectives"]), tuple(progress["excesses"]), progress["since"]
-        ),
-        solutions=tuple(solutions),
-        history=[HistoryRow.from_values(state["columns"], row) for row in state["rows"]],
-        initial_deviation=arrays["initial_deviation"],
-        choice=choice,
-        stiffening=None if stiffening is None else Stiffening(**stiffening),
-    )
+    modes = {k: _modes(arrays, k, arm) for k, arm in arms.items()}
+    return replace(memory, cells=cells, modes=modes)
 
 
 def _modes(arrays: Mapping[str, np.ndarray], index: int, arm: Arm) -> list[np.ndarray]:

@@ -6,7 +6,7 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from dolfinopt.mesh.arm_mesh import ArmMesh
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.stress_report import ArmStress
-
-
-CIRCLE = 48  # corners that stand for a circle in pictures
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,16 +148,15 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
     scale = np.array([arm.length / pattern.length, arm.height / pattern.height])
     outlines = []
     for region in pattern.regions:
-        x0, y0, x1, y1 = region.bounds
-        if region.box is not None:
-            points = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
-        else:
-            turn = np.exp(2j * np.pi * np.arange(CIRCLE) / CIRCLE)
-            radius = 0.5 * (x1 - x0)
-            points = np.column_stack([x0 + radius * (1 + turn.real), y0 + radius * (1 + turn.imag)])
-        outlines.append((region.kind, points * scale))
-        if pattern.symmetric_about[0]:
-            outlines.append((region.kind, points * scale * [1.0, -1.0]))
+        import shapely
+
+        shape = shapely.box(*region.bounds)
+        if region.circle is not None:
+            *centre, radius = region.circle
+            shape = shapely.Point(centre).buffer(radius)
+        for mirror in (1.0, -1.0) if pattern.symmetric_about[0] else (1.0,):
+            points = np.array(shape.exterior.coords) * scale * [1.0, mirror]
+            outlines.append((region.kind, points))
     return tuple(outlines)
 
 
@@ -271,12 +267,28 @@ def read_views(scene: Scene, path: Path) -> list[ArmView]:
 
     from dolfinopt.profiling import Profile
 
-    return gather_views(scene, *arms_with_design(MPI.COMM_SELF, scene, path, Profile()))
+    return gather_views(*arms_with_design(MPI.COMM_SELF, scene, path, Profile()))
+
+
+class Designed(NamedTuple):
+    """A scene's arms with a design, in the order in which functions of both take them.
+
+    Attributes:
+        scene: whose arms they are.
+        partition: which ranks do which arm.
+        arms: this rank's, by their places.
+        x_phys: (n_cells,) physical densities of each.
+    """
+
+    scene: Scene
+    partition: Partition
+    arms: Mapping[int, Arm]
+    x_phys: Mapping[int, np.ndarray]
 
 
 def arms_with_design(
     world: MPI.Comm, scene: Scene, design: Path | None, profile: Profile
-) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
+) -> Designed:
     """Build the arms; return them with the physical densities of a file, or the initial ones.
 
     Raises:
@@ -287,9 +299,9 @@ def arms_with_design(
 
     partition = partition_arms(world, scene.cell_counts, undivided=scene.dimension == 2)
     arms = build_arms(scene, partition, profile)
-    if design is not None:
-        return partition, arms, read_design(design, partition, arms)
-    return partition, arms, uniform_design(scene, partition, arms)
+    if design is None:
+        return Designed(scene, partition, arms, uniform_design(scene, partition, arms))
+    return Designed(scene, partition, arms, read_design(design, partition, arms))
 
 
 def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:
@@ -427,69 +439,34 @@ def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
     All designed arms are one grid, as few programs read collections, one below the other, in m;
     without one it is not written.
     """
-    if not (arms := designed(views)):
-        return
-    points, cells, offset, count = [], [], 0.0, 0
-    for view in arms:
-        own, corners = _merge_corners(view.corners)
-        points.append(np.pad(own, ((0, 0), (0, 3 - own.shape[1]))) + np.array([0.0, offset, 0.0]))
-        cells.append(corners + count)
-        offset -= 2.0 * np.ptp(own[:, 1])
-        count += len(own)
-    numbers = [k for k, view in enumerate(views) if view.designed]
-    fields: dict[str, list[Any]] = {
-        "density": [view.density for view in arms],
-        "arm": [np.full(len(view.density), k) for k, view in zip(numbers, arms, strict=True)],
-        "stress": [view.stress for view in arms],
-        "wall": [view.wall for view in arms],
-    }
-    known = {k: values for k, values in fields.items() if all(x is not None for x in values)}
-    kinds = [VTK_CELLS[view.corners.shape[2], view.corners.shape[1]] for view in arms]
-    _write_vtu(folder / "design.vtu", np.vstack(points), cells, kinds, known)
-
-
-def _write_vtu(
-    path: Path,
-    points: np.ndarray,
-    cells: Sequence[np.ndarray],
-    kinds: Sequence[int],
-    fields: Mapping[str, Any],
-) -> None:
-    """Write points (n, 3) and blocks of cells (m, corners), VTK's kind and fields of each."""
-    # VTK's own modules: PyVista takes 0.3 s more to import.
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+    import pyvista
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    grid, places, blocks = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
-    places.SetData(numpy_to_vtk(points, deep=True))
-    grid.SetPoints(places)
-    counts = np.concatenate([np.full(len(block), block.shape[1]) for block in cells])
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    connectivity = np.concatenate([block.ravel() for block in cells])
-    blocks.SetData(*(numpy_to_vtkIdTypeArray(x, deep=True) for x in (offsets, connectivity)))
-    types = np.repeat(np.array(kinds, dtype=np.uint8), [len(block) for block in cells])
-    grid.SetCells(numpy_to_vtk(types, deep=True), blocks)
-    for name, values in fields.items():
-        array = numpy_to_vtk(np.concatenate(values), deep=True)
-        array.SetName(name)
-        grid.GetCellData().AddArray(array)
-    grid.GetCellData().SetActiveScalars("density")
+    grids, below = pyvista.MultiBlock(), 0.0
+    for number, view in enumerate(views):
+        if not view.designed:
+            continue
+        cells, corners, dim = view.corners.shape
+        points = np.zeros((cells * corners, 3))
+        points[:, :dim] = view.corners.reshape(-1, dim)
+        points[:, 1] -= below
+        below += 2.0 * np.ptp(view.corners[:, :, 1])
+        nodes = np.arange(len(points)).reshape(cells, corners)
+        grid = pyvista.UnstructuredGrid({VTK_CELLS[dim, corners]: nodes}, points).clean()
+        fields = {"density": view.density, "arm": np.full(cells, number), "stress": view.stress,
+                  "wall": view.wall}  # fmt: skip
+        grid.cell_data.update({name: item for name, item in fields.items() if item is not None})
+        grids.append(grid)
+    if not len(grids):
+        return
+    every = grids.combine()  # with the fields that all arms have
+    every.set_active_scalars("density")
     writer = vtkXMLUnstructuredGridWriter()
-    writer.SetInputData(grid)
+    writer.SetInputData(every)
     writer.SetDataModeToBinary()
-    writer.WriteToOutputStringOn()
+    writer.WriteToOutputStringOn()  # a full disk is told
     writer.Write()
-    write_text(path, writer.GetOutputString())
-
-
-def _merge_corners(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, d) and cells (n_cells, corners) of cells that share their corners."""
-    flat = corners.reshape(-1, corners.shape[2])
-    rounded = np.round(flat / (1e-9 * np.ptp(flat, axis=0).max()))
-    _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    return flat[kept], place.reshape(corners.shape[:2])
+    write_text(folder / "design.vtu", writer.GetOutputString())
 
 
 # -- history.csv: a line an iteration, written as it happens and read back -----------------------

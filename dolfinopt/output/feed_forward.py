@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +16,14 @@ from dolfinopt.disk import write_table
 from dolfinopt.dynamics.build import Trajectory, simulate
 from dolfinopt.dynamics.feed_forward import FeedForward, internal_rates
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.output.trajectory import drive_units
-from dolfinopt.parallel import Partition, gather_arms, on_root, together
+from dolfinopt.output.design import Designed
+from dolfinopt.output.trajectory import UNITS, drive_units
+from dolfinopt.parallel import gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.csv_table import BESIDE_JOINTS
 from dolfinopt.scene.load import Scene, scene_from_dict
 
 if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
     from dolfinopt.optimization.result import RankResult
 
 FILE = "feed_forward.csv"
@@ -56,10 +56,10 @@ def comparison_of(run: RankResult) -> Comparison | None:
     if not scene.feed_forward.on:
         return None
     held = None if run.trajectory is None else run.trajectory.feed_forward
-    place = run.partition, run.arms, run.x_phys
+    place = Designed(scene, run.partition, run.arms, run.x_phys)
     with run.profile.phase("feed-forward beside"):
-        plain = simulated_with(with_feed_forward(scene, "none"), *place)
-        finer = finer_deviation(scene, *place, held)
+        plain = simulated_with(place._replace(scene=with_feed_forward(scene, "none")))
+        finer = finer_deviation(place, held)
 
     def comparison() -> Comparison:
         if plain is None:
@@ -81,43 +81,34 @@ def with_feed_forward(scene: Scene, kind: str) -> Scene:
     return scene_from_dict(data, scene.source)
 
 
-def finer_deviation(
-    scene: Scene,
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Mapping[int, np.ndarray],
-    held: FeedForward | None,
-) -> float | None:
+def finer_deviation(design: Designed, held: FeedForward | None) -> float | None:
     """Return the largest deviation in a finer model, m; None where it is not solved (collective).
 
     It has twice the elastic coordinates, and geometric stiffness.
 
     Args:
-        scene, partition, arms: of the model, with the number of coordinates.
-        x_phys: the design.
+        design: of the model, with the number of coordinates.
         held: the model's corrections, on the root, with which the finer one moves, too.
     """
-    sizes = [min(2 * (arm.coordinates or 0), arm.substructure.T.num_dofs) for arm in arms.values()]
-    count = partition.world.allreduce(min(sizes, default=maxsize), min)
+    scene, world = design.scene, design.partition.world
+    sizes = [
+        min(2 * (arm.coordinates or 0), arm.substructure.T.num_dofs) for arm in design.arms.values()
+    ]
+    count = world.allreduce(min(sizes, default=maxsize), min)
     changes = {
         "reduction": scene.reduction.unchecked_copy({"coordinates": count}),
         "simulation": scene.simulation.unchecked_copy({"stiffening": True}),
     }
-    moved = simulated_with(scene.unchecked_copy(changes), partition, arms, x_phys, held)
-    return on_root(partition.world, lambda: None if moved is None else moved.max_deviation[0])
+    moved = simulated_with(design._replace(scene=scene.unchecked_copy(changes)), held)
+    return on_root(world, lambda: None if moved is None else moved.max_deviation[0])
 
 
-def simulated_with(
-    scene: Scene,
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Mapping[int, np.ndarray],
-    held: FeedForward | None = None,
-) -> Trajectory | None:
+def simulated_with(design: Designed, held: FeedForward | None = None) -> Trajectory | None:
     """Return the motion of a scene with other arms' designs, on the root (collective).
 
     None elsewhere, and where it is not solved. The arms keep what they have.
     """
+    scene, partition, arms, x_phys = design
     with together(partition.world):
         bodies = {k: arm.under(scene).reduce(x_phys[k]) for k, arm in arms.items()}
     owned = gather_arms(partition, bodies)
@@ -154,9 +145,10 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
 
 
 def summary_of_feed_forward(
-    scene: Scene, feed_forward: FeedForward | None, comparison: Comparison | None
+    trajectory: Trajectory, comparison: Comparison | None
 ) -> dict[str, Any] | None:
     """Return what summary.json tells of a feed-forward; None without."""
+    scene, feed_forward = trajectory.scene, trajectory.feed_forward
     if feed_forward is None or comparison is None:
         return None
     names, units = list(scene.rigid_units), list(scene.rigid_units.values())
@@ -175,15 +167,9 @@ def summary_of_feed_forward(
         "corrections": {names[k]: float(x) for k, x in zip(joints, largest, strict=True)},
         "slowest_unstable_rate": slowest_unstable_rate(feed_forward),
         "units": {
-            "lead": "s",
-            "knots": "-",
-            "regularity": "-",
-            "deviation_without": "m",
-            "deviation_left": "m",
-            "deviation_left_finer": "m",
+            **UNITS["feed_forward"],
             "drive_peak_without": drive_units(scene),
             "corrections": ", ".join(units[k] for k in joints),
-            "slowest_unstable_rate": "1/s",
         },
     }
 
@@ -197,15 +183,15 @@ def slowest_unstable_rate(feed_forward: FeedForward) -> float | None:
     return float(unstable.min()) if len(unstable) else None
 
 
-def lead_warnings(trajectory: Trajectory | None, grey: bool) -> list[str]:
-    """Return that corrections would begin earlier than the lead lets them, and what to do."""
-    if trajectory is None or trajectory.feed_forward is None:
-        return []
+def lead_warnings(trajectory: Trajectory, grey: bool) -> Iterator[str]:
+    """Yield that corrections would begin earlier than the lead lets them, and what to do."""
+    if trajectory.feed_forward is None:
+        return
     rate, lead = slowest_unstable_rate(trajectory.feed_forward), trajectory.scene.lead
-    if rate is None or not 0.0 < lead < 3.0 / rate:
-        return []
-    cells = "nearly void cells of a grey design vibrate slowly: set design.projection, or "
-    return [
-        f"feed-forward: the corrections would begin about {3e3 / rate:.2g} ms before the motion, "
-        f"which feed_forward.lead = {lead:g} [s] cuts off; {cells if grey else ''}raise it"
-    ]
+    if rate is not None and 0.0 < lead < 3.0 / rate:
+        cells = "nearly void cells of a grey design vibrate slowly: set design.projection, or "
+        yield (
+            f"feed-forward: the corrections would begin about {3e3 / rate:.2g} ms before the "
+            f"motion, which feed_forward.lead = {lead:g} [s] cuts off; "
+            f"{cells if grey else ''}raise it"
+        )

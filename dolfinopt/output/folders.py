@@ -10,7 +10,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dolfinopt.disk import FULL, make_folder, unwritten, working_in, writing
+from dolfinopt.disk import FULL, make_folder, unwritten, working_in, write_bytes, writing
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import interrupted_later
 from dolfinopt.scene.load import Scene
@@ -65,11 +65,8 @@ def prepare_folder(folder: Path) -> None:
         probe.write_bytes(b"")
         probe.unlink()
     except OSError as error:
-        if error.errno in FULL:
-            raise unwritten(folder, error) from error
-        raise InputError(
-            f"{folder}: --out cannot be written ({error.strerror}); name a folder you may write"
-        ) from None
+        reason = unwritten(folder, error)
+        raise reason if error.errno in FULL else InputError(str(reason)) from None
 
 
 @contextmanager
@@ -150,10 +147,10 @@ def remove_stale(
 
 
 @contextmanager
-def written_together(folder: Path) -> Iterator[Path]:
+def written_together(folder: Path, last: str = RUN_FILES[0]) -> Iterator[Path]:
     """Yield a folder for files that get into `folder` together at the end, or not at all.
 
-    The summary is the last one. Ctrl-C waits while they get their places.
+    One is the last, by default the summary. Ctrl-C waits while they get their places.
 
     Raises:
         OutputError: the disk is full, for instance.
@@ -163,7 +160,7 @@ def written_together(folder: Path) -> Iterator[Path]:
     make_folder(place)
     try:
         yield place
-        paths = sorted(place.iterdir(), key=lambda path: path.name == RUN_FILES[0])
+        paths = sorted(place.iterdir(), key=lambda path: path.name == last)
         with interrupted_later(), writing(folder):
             for path in paths:
                 os.replace(path, folder / path.name)
@@ -180,32 +177,22 @@ def check_new(files: Iterable[Path], hint: str = "") -> None:
             )
 
 
-def write_new(new: Mapping[Path, str | bytes], replaced: Mapping[Path, str | bytes]) -> None:
+def write_new(
+    folder: Path, new: Mapping[str, str | bytes], replaced: Mapping[str, str | bytes]
+) -> None:
     """Write all files of `new`, none of which may be there yet, and those of `replaced`.
 
-    They get their names, in this order, when all of them are on the disk.
+    They get into the folder together, the last of all the last.
 
     Raises:
-        InputError: one exists, or cannot be written; then none of `new` is left.
+        InputError: one exists, or the folder cannot be written.
     """
-    check_new(new)
-    parts: dict[Path, Path] = {}
-    path = Path()
-    try:
-        for path, content in [*new.items(), *replaced.items()]:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            parts[path] = path.with_name(f".{path.name}.{os.getpid()}.part")
-            data = content if isinstance(content, bytes) else content.encode()
-            parts[path].write_bytes(data)
-        for path, part in parts.items():
-            os.replace(part, path)
-    except BaseException as error:
-        for done in (*parts.values(), *(path for path in parts if path in new)):
-            with suppress(OSError):
-                done.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise InputError(f"{path}: cannot be written ({error.strerror})") from None
-        raise
+    check_new(folder / name for name in new)
+    prepare_folder(folder)
+    files = {**replaced, **new}
+    with written_together(folder, [*files][-1]) as place:
+        for name, content in files.items():
+            write_bytes(place / name, content if isinstance(content, bytes) else content.encode())
 
 
 def record_of_parts(design: Path | None, folder: Path, files: Iterable[str]) -> dict[str, Any]:

@@ -33,6 +33,12 @@ class JointLimit:
     unit: str
     met: bool
 
+    @property
+    def sentence(self) -> str:
+        """E.g. "elbow 3.2 of 3.1416 rad at 1.2 s"."""
+        used = f"{self.joint} {self.value:.4g} of {self.limit:.4g} {self.unit}"
+        return f"{used} at {self.instant:.3g} s"
+
 
 def joint_limits(trajectory: Trajectory) -> Iterator[JointLimit]:
     """Yield how a motion stands to every limit of position, velocity and effort."""

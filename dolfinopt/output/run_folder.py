@@ -19,11 +19,12 @@ from mpi4py import MPI
 from dolfinopt.errors import InputError
 from dolfinopt.optimization import loop
 from dolfinopt.optimization.loop import Report
-from dolfinopt.optimization.result import RankResult
+from dolfinopt.optimization.result import RankResult, simulation_result
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import (
     ArmView,
+    Designed,
     append_history,
     gather_views,
     write_design,
@@ -43,22 +44,17 @@ from dolfinopt.output.summary import summarise, write_budget, write_summary
 from dolfinopt.output.trajectory import write_trajectory
 from dolfinopt.parallel import Partition, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.stress_report import stress_report
+from dolfinopt.responses.evaluation import evaluate
+from dolfinopt.responses.order_selection import choose_coordinates
+from dolfinopt.responses.stress_report import ArmStress, stress_report
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import named_files, with_relative_paths
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
+HISTORY = "history.csv"
 Draw = Callable[[Path, list[ArmView]], None]
-
-
-@dataclass(frozen=True)
-class Written:
-    """What the root wrote: every arm as pictures need it, and the content of summary.json."""
-
-    views: list[ArmView]
-    summary: Mapping[str, Any]
 
 
 def write_result(
@@ -68,10 +64,10 @@ def write_result(
     *,
     paraview: bool = True,
     pictures: Draw | None = None,
-) -> Written | None:
+) -> Mapping[str, Any] | None:
     """Write design, trajectory and summary of a result, all or none (collective).
 
-    Returns None but on the root.
+    Returns the content of summary.json; None but on the root.
 
     Args:
         folder: exists; of an optimisation history and checkpoint are there already.
@@ -81,10 +77,7 @@ def write_result(
         pictures: draws the arms' views in a folder before the summary is written, on the root.
     """
     begun = time.perf_counter() - wall
-    stress = stress_report(result.partition, result.arms, result.trajectory, result.profile)
-    views = gather_views(
-        result.scene, result.partition, result.arms, result.x_phys, stress, result.x_filtered
-    )
+    views, stress = views_of(result)
     summary = summarise(result, wall, stress)
     with together(result.partition.world):
         if result.trajectory is None:
@@ -107,29 +100,48 @@ def write_result(
             summary["files"] = {name: row[key] for name, row, key in named_files(summary["scene"])}
             summary["scene"] = with_relative_paths(summary["scene"], folder)
             write_summary(place, summary)
-        return Written(views, summary)
+        return summary
+
+
+def views_of(result: RankResult) -> tuple[list[ArmView], dict[int, ArmStress]]:
+    """Return every arm as pictures need it, on the root, and stresses (collective)."""
+    stress = stress_report(result.partition, result.arms, result.trajectory, result.profile)
+    place = result.scene, result.partition, result.arms, result.x_phys
+    return gather_views(*place, stress, result.x_filtered), stress
+
+
+def simulated(design: Designed, profile: Profile) -> RankResult:
+    """Return the result of simulating a design (collective)."""
+    choice = choose_coordinates(*design, profile)
+    return simulation_result(*design, *evaluate(*design, profile), profile, choice)
 
 
 # -- an optimisation in a folder -------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
 class FolderRecorder:
-    """Writes history.csv and checkpoint.npz, see `loop.Recorder`."""
+    """Writes history.csv and checkpoint.npz, see `loop.Recorder`.
 
-    def __init__(self, folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm]):
-        """Take the folder, which exists, and what the checkpoint describes."""
-        self.folder, self.scene, self.partition, self.arms = folder, scene, partition, arms
-        self.history = folder / "history.csv"
+    Attributes:
+        folder: exists.
+        scene, partition, arms: what the checkpoint describes.
+    """
+
+    folder: Path
+    scene: Scene
+    partition: Partition
+    arms: Mapping[int, Arm]
 
     def begin(self, rows: Sequence[HistoryRow]) -> None:
         """Write the history anew with the rows known so far (collective)."""
         with together(self.partition.world):
             if self.partition.world.rank == 0:
-                write_history(self.history, rows)
+                write_history(self.folder / HISTORY, rows)
 
     def append(self, row: HistoryRow) -> None:
         """Add a line to the history (root only)."""
-        append_history(self.history, row)
+        append_history(self.folder / HISTORY, row)
 
     def save(self, memory: Memory) -> None:
         """Replace the checkpoint (collective)."""

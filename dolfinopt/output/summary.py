@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import resource
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,13 +25,9 @@ from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
 from dolfinopt.output.feed_forward import comparison_of, lead_warnings, summary_of_feed_forward
-from dolfinopt.output.joint_limits import JointLimit, joint_limits
+from dolfinopt.output.joint_limits import joint_limits
 from dolfinopt.output.torsion import torsion_warnings
-from dolfinopt.output.trajectory import (
-    drive_units,
-    free_drives,
-    trajectory_units,
-)
+from dolfinopt.output.trajectory import UNITS, drive_units, free_drives, trajectory_units
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
 from dolfinopt.profiling import Counts
 from dolfinopt.responses.constraints import limits_of, summary_of
@@ -45,50 +41,7 @@ from dolfinopt.version import __version__
 if TYPE_CHECKING:
     from dolfinopt.optimization.result import RankResult, Result
 
-# Of summary.json's figures; those without a unit are "-". Constraints state theirs themselves.
-SUMMARY_UNITS = {
-    "compliance": "N m",
-    "max_deviation": "m",
-    "max_deviation_time": "s",
-    "max_rotation": "rad",
-    "settling": "m",
-    "loop_start": "rad, m",
-    "deflection_budget": "m, shares -",
-    "stress": "Pa",
-    "mass": "kg",
-    "designed_mass": "kg",
-    "grayness": "-",
-    "volume_fraction": "-",
-    "connected": "-",
-    "contacts": "-",
-    "minimum_member_measured": "m",
-    "minimum_gap_measured": "m",
-    "too_narrow": "m",
-    "first_frequency": "Hz",
-    "first_frequency_error": "-",
-    "loaded_frequency": "Hz",
-    "simulation_error_estimate": "-",
-    "kkt": "-",
-    "seconds": "s",
-    "peak_memory_mb": "MB",
-}
-
-CERTIFICATE_UNITS = {
-    "kkt": "-",
-    "gradient_angle": "degree",
-    "gradient_ratio": "-",
-    "seconds": "s",
-}
-
-HISTORY_UNITS = {
-    "max_deviation": "m",
-    "grayness": "-",
-    "volume_fraction": "-",
-    "change": "-",
-    "seconds": "s",
-    "kkt": "-",
-    "merit": "-",
-}
+CONTACTS = "pieces", "corners", "edges", "places", "left_out", "remaining"  # of `Contacts`
 
 # Outboard deflection over length up to which an arm deforms little. A beam bent by a tenth of its
 # length has a slope of 0.15 to 0.2 at its end and is 0.6 % shorter, which linear elasticity leaves
@@ -119,31 +72,32 @@ def summarise(
         wall: seconds since the command began, s.
         stress: of every arm with a design, by its place in the chain, see `stress_report`.
     """
-    scene, partition = run.scene, run.partition
+    scene, partition, trajectory = run.scene, run.partition, run.trajectory
     cost = _cost(run, wall)  # without what follows
     traits, comparison = _gather_traits(run), comparison_of(run)
     stiffening = stiffening_of(run.arms)
     with together(partition.world):
-        if partition.world.rank != 0:
+        if trajectory is None:  # this is not the root
             return {}
         return {
             "name": scene.name,
             **_figures(run.evaluation),
-            "max_deviation_time": run.evaluation.max_deviation_time,
-            **({} if run.trajectory is None else _machine(scene, run.trajectory)),
+            **_machine(trajectory),
             "loop_start": loop_start(scene),
-            "feed_forward": None
-            if run.trajectory is None
-            else summary_of_feed_forward(scene, run.trajectory.feed_forward, comparison),
-            "deflection_budget": budget_of(run.trajectory),
+            "feed_forward": summary_of_feed_forward(trajectory, comparison),
+            "deflection_budget": budget_of(trajectory),
             "stress": _stress(scene, stress or {}),
-            **_of_designs(run, traits),
+            **_of_designs(run, trajectory, traits),
             **_of_responses(run),
             "simulation_error_estimate": run.evaluation.error,
-            "integrator": None if run.trajectory is None else _integrator(run.trajectory),
+            "integrator": {
+                "method": f"Radau IIA, {len(trajectory.solution.nodes)} stages",
+                "strategy": trajectory.solution.strategy.value,
+                "steps": len(trajectory.solution.a),
+            },
             "reduction": _reduction(scene, run.choice),
             "stiffening": None if stiffening is None else asdict(stiffening),
-            "warnings": _all_warnings(run, traits),
+            "warnings": list(_all_warnings(run, trajectory, traits)),
             "iterations": run.iterations,
             "best_iteration": run.best_iteration,
             "converged": run.converged,
@@ -154,7 +108,7 @@ def summarise(
             "certificate": None if run.certificate is None else run.certificate.to_dict(),
             **({} if run.bars is None else {"bars": _bars(run)}),
             **cost,
-            "units": _units(scene, run.trajectory),
+            "units": _units(trajectory),
             "versions": versions(),
             "scene": scene.to_dict(),
         }
@@ -167,13 +121,9 @@ def figures(run: RankResult, wall: float) -> dict[str, Any]:
         run: the design and what came of it.
         wall: seconds that it took.
     """
-    volumes = {k: _volume(run.scene, k, arm) for k, arm in run.arms.items()}
-    grayness = sum(volumes[k] * arm.grayness(run.x_phys[k]) for k, arm in run.arms.items())
     return {
         "name": run.scene.name,
         **_figures(run.evaluation),
-        "max_deviation_time": run.evaluation.max_deviation_time,
-        "grayness": grayness / (sum(volumes.values()) or 1.0),
         "iterations": run.iterations,
         "stop_reason": run.stop_reason,
         "seconds": {"total": wall},
@@ -215,7 +165,9 @@ def _gather_traits(run: RankResult) -> dict[int, _Traits]:
     return {k: replace(item, widths=widths.get(k, item.widths)) for k, item in traits.items()}
 
 
-def _of_designs(run: RankResult, traits: Mapping[int, _Traits]) -> dict[str, Any]:
+def _of_designs(
+    run: RankResult, trajectory: Trajectory, traits: Mapping[int, _Traits]
+) -> dict[str, Any]:
     """Return what the designs are like, and the frequencies of the arms, by the arm's name."""
     scene = run.scene
     by_arm = {
@@ -229,11 +181,14 @@ def _of_designs(run: RankResult, traits: Mapping[int, _Traits]) -> dict[str, Any
         "grayness": _grayness(traits),
         "volume_fraction": {name: item.volume_fraction for name, item in by_arm.items()},
         "connected": max((trait.contacts.pieces for trait in traits.values()), default=0),
-        "contacts": {name: _contacts(item.contacts) for name, item in by_arm.items()},
+        "contacts": {
+            name: {key: np.array(getattr(item.contacts, key)).tolist() for key in CONTACTS}
+            for name, item in by_arm.items()
+        },
         "minimum_member_measured": {name: _size(item.widths[0]) for name, item in by_arm.items()},
         "minimum_gap_measured": {name: _size(item.widths[1]) for name, item in by_arm.items()},
         "too_narrow": [asdict(item) for item in _too_narrow(run, traits)],
-        "first_frequency": _first_frequencies(run, by_arm),
+        "first_frequency": _first_frequencies(trajectory, by_arm),
         "first_frequency_error": {
             name: item.error for name, item in by_arm.items() if item.error is not None
         },
@@ -297,23 +252,10 @@ def _too_narrow(run: RankResult, traits: Mapping[int, _Traits]) -> list[_Narrow]
     ]
 
 
-def _contacts(contacts: Contacts) -> dict[str, Any]:
-    """Return the entry of an arm's contacts."""
-    return {
-        "pieces": contacts.pieces,
-        "corners": contacts.corners,
-        "edges": contacts.edges,
-        "places": contacts.places.tolist(),
-        "left_out": contacts.left_out,
-        "remaining": contacts.remaining,
-    }
-
-
-def _first_frequencies(run: RankResult, by_arm: Mapping[str, _Traits]) -> dict[str, float]:
+def _first_frequencies(trajectory: Trajectory, by_arm: Mapping[str, _Traits]) -> dict[str, float]:
     """Return those of flexible arms by name, Hz; of a body from a file, what its modes tell."""
     frequencies = {}
-    bodies = () if run.trajectory is None else run.trajectory.mechanism.arms
-    for arm, body in zip(run.scene.arms, bodies, strict=False):
+    for arm, body in zip(trajectory.scene.arms, trajectory.mechanism.arms, strict=True):
         own = by_arm[arm.name].frequency if arm.name in by_arm else None
         value = body.first_frequency if own is None else own
         if np.isfinite(value):
@@ -340,30 +282,33 @@ def _bars(run: RankResult) -> dict[str, Any]:
     return {**_figures(run.bars), "constraints": summary_of(limits_of(run.scene, run.bars))}
 
 
-def motion_warnings(run: Result) -> list[str]:
-    """Return a sentence on everything of a scene and its motion that puts the figures in doubt."""
-    return [
-        *implausible(run.scene),
-        *_warnings(run.scene, run.evaluation),
-        *_too_few(run.scene, run.choice),
-        *torsion_warnings(run.trajectory),
-        *_limits_exceeded(run.trajectory),
-        *unjudged(run.scene),
-        *_on_closures(run.scene, run.trajectory),
-        *([] if (rest := forced_rest(run.scene)) is None else [rest]),
-    ]
+def motion_warnings(run: Result, trajectory: Trajectory) -> Iterator[str]:
+    """Yield a sentence on everything of a scene and its motion that puts the figures in doubt."""
+    scene = run.scene
+    yield from implausible(scene)
+    yield from _large_deflections(scene, run.evaluation)
+    yield from _too_few(scene, run.choice)
+    yield from torsion_warnings(trajectory)
+    if beyond := [limit.sentence for limit in joint_limits(trajectory) if not limit.met]:
+        yield f"limits exceeded: {', '.join(beyond)}"
+    yield from unjudged(scene)
+    yield from _on_closures(trajectory)
+    yield from filter(None, [forced_rest(scene)])
 
 
-def _all_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
+def _all_warnings(
+    run: RankResult, trajectory: Trajectory, traits: Mapping[int, _Traits]
+) -> Iterator[str]:
     grey = is_grey(run.scene, _grayness(traits))
-    return [
-        *(note for trait in traits.values() for note in trait.notes),
-        *motion_warnings(run),
-        *_unstiffened(stiffening_of(run.arms)),
-        *lead_warnings(run.trajectory, grey),
-        *([] if grey else _contact_warnings(run, traits)),
-        *(item.sentence for item in _too_narrow(run, traits)),
-    ]
+    for trait in traits.values():
+        yield from trait.notes
+    yield from motion_warnings(run, trajectory)
+    yield from _unstiffened(stiffening_of(run.arms))
+    yield from lead_warnings(trajectory, grey)
+    if not grey:
+        yield from _contact_warnings(run, traits)
+    for item in _too_narrow(run, traits):
+        yield item.sentence
 
 
 def _cost(run: RankResult, wall: float) -> dict[str, Any]:
@@ -381,35 +326,29 @@ def _cost(run: RankResult, wall: float) -> dict[str, Any]:
     }
 
 
-def _integrator(trajectory: Trajectory) -> dict[str, Any]:
-    """Return how the motion was integrated, and why so."""
-    solution = trajectory.solution
-    return {
-        "method": f"Radau IIA, {len(solution.nodes)} stages",
-        "strategy": solution.strategy.value,
-        "steps": len(solution.a),
-    }
-
-
-def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
+def _machine(trajectory: Trajectory) -> dict[str, Any]:
     """Return masses, drives and residual vibration; of machines control errors and reactions."""
-    columns = scene.driven_columns
+    scene, bodies = trajectory.scene, trajectory.mechanism.arms
 
     def by_drive(values: np.ndarray) -> dict[str, float]:
-        return dict(zip(scene.driven, map(float, values[columns]), strict=True))
+        return dict(zip(scene.driven, map(float, values[scene.driven_columns]), strict=True))
 
     peak, rms = trajectory.drives
-    bodies = trajectory.mechanism.arms
+    pairs = zip(bodies, scene.owners, strict=True)
     result = {
         "max_rotation": trajectory.max_rotation,
         "settling": trajectory.settling,
         "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
-        "designed_mass": _designed_mass(scene, bodies),
+        "designed_mass": float(sum(body.mass for body, owner in pairs if owner is not None)),
         "drive_peak": by_drive(peak),
         "drive_rms": by_drive(rms),
     }
-    if of_joints := _by_joint(joint_limits(trajectory)):
-        result["joint_limits"] = of_joints
+    limits: dict[str, dict[str, Any]] = {}
+    for limit in joint_limits(trajectory):
+        entry = asdict(limit)
+        limits.setdefault(entry.pop("joint"), {})[entry.pop("quantity")] = entry
+    if limits:
+        result["joint_limits"] = limits
     if free := free_drives(scene):
         errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
         result["drive_error_peak"] = {name: errors[name] for name in free}
@@ -424,51 +363,22 @@ def _machine(scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
     return result
 
 
-def _designed_mass(scene: Scene, bodies: Sequence[Any]) -> float:
-    """Return the mass of the arms that have a design, of their own or another's, kg."""
-    pairs = zip(bodies, scene.owners, strict=True)
-    return float(sum(body.mass for body, owner in pairs if owner is not None))
-
-
-def _by_joint(limits: Iterable[JointLimit]) -> dict[str, dict[str, Any]]:
-    """Return the limits of joints by joint and quantity."""
-    result: dict[str, dict[str, Any]] = {}
-    for limit in limits:
-        entry = asdict(limit)
-        result.setdefault(entry.pop("joint"), {})[entry.pop("quantity")] = entry
-    return result
-
-
-def _limits_exceeded(trajectory: Trajectory | None) -> list[str]:
-    """Return a sentence that names the limits of joints beyond which the motion goes."""
-    if trajectory is None:
-        return []
-    beyond = [
-        f"{limit.joint} {limit.value:.4g} of {limit.limit:.4g} {limit.unit} "
-        f"at {limit.instant:.3g} s"
-        for limit in joint_limits(trajectory)
-        if not limit.met
-    ]
-    return [f"limits exceeded: {', '.join(beyond)}"] if beyond else []
-
-
-def _on_closures(scene: Scene, trajectory: Trajectory | None) -> list[str]:
-    """Return sentences on closures that hold rigid arms more often than needed."""
-    if trajectory is None or trajectory.loops is None:
-        return []
-    problem, told = trajectory.problem, []
+def _on_closures(trajectory: Trajectory) -> Iterator[str]:
+    """Yield sentences on closures that hold rigid arms more often than needed."""
+    if trajectory.loops is None:
+        return
+    problem = trajectory.problem
     if problem.num_redundant:
         _, first, last = problem.ends
-        told.append(
+        yield (
             f"closures: of {last - first} equations {problem.num_redundant} follow from the others "
             "for rigid arms; where no arm resists, the smallest forces are told"
         )
-    if (left := misfit(scene)) > 0.0:
-        told.append(
+    if (left := misfit(trajectory.scene)) > 0.0:
+        yield (
             f"closures: rigid arms leave {left:.3g} m open; closing it would add forces of "
             f"{problem.left_stress():.3g} N, which are left out"
         )
-    return told
 
 
 def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | None:
@@ -484,11 +394,11 @@ def _stress(scene: Scene, stress: Mapping[int, ArmStress]) -> dict[str, Any] | N
     }
 
 
-def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
+def _units(trajectory: Trajectory) -> dict[str, Any]:
     """Return the unit of every figure, and of every column of history.csv and trajectory.csv."""
-    unit = scene.objective.response.unit
-    units: dict[str, Any] = {"objective": unit, **SUMMARY_UNITS}
-    units["certificate"] = {**CERTIFICATE_UNITS, "exact_objective": unit}
+    scene, unit = trajectory.scene, trajectory.scene.objective.response.unit
+    units: dict[str, Any] = {"objective": unit, **UNITS["summary"]}
+    units["certificate"] = {**UNITS["certificate"], "exact_objective": unit}
     units["drive_peak"] = units["drive_rms"] = drive_units(scene)
     if free := free_drives(scene):
         rigid = scene.rigid_units
@@ -497,9 +407,8 @@ def _units(scene: Scene, trajectory: Trajectory | None) -> dict[str, Any]:
         parts = {closure.name: closure.parts(scene.dimension) for closure in scene.closures}
         units["closure_peak"] = {name: {u: u for _, u in own} for name, own in parts.items()}
         units |= {} if scene.is_spatial else {"closure_force_peak": "N"}
-    units["history.csv"] = {"objective": unit, **HISTORY_UNITS, "multipliers": unit}
-    if trajectory is not None:
-        units["trajectory.csv"] = trajectory_units(trajectory)
+    units["history.csv"] = {"objective": unit, **UNITS["history"], "multipliers": unit}
+    units["trajectory.csv"] = trajectory_units(trajectory)
     return units
 
 
@@ -539,7 +448,7 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         arm.volume_fraction(x_phys),
         arm.grayness(x_phys),
         (scene.arms[index].cells and scene.arms[index].cell_size) or arm.mesh.cell_size,
-        _volume(scene, index, arm),
+        len(arm.places) * scene.arms[index].depth * arm.mesh.comm.allreduce(arm.mesh.area.sum()),
         tuple(arm.mesh.notes),
         arm.contacts(arm.kind.share(x_phys) > SOLID),
     )
@@ -556,9 +465,9 @@ def is_grey(scene: Scene, grayness: float) -> bool:
     return not scene.design.projection and grayness > GREY
 
 
-def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[str]:
-    """Return a sentence on every arm with contacts, and one where its crisp design falls apart."""
-    scene, result = run.scene, []
+def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> Iterator[str]:
+    """Yield a sentence on every arm with contacts, and one where its crisp design falls apart."""
+    scene = run.scene
     rated = run.iterations > 0 and bool(scene.design.projection)
     for k, trait in traits.items():
         contacts, arm = trait.contacts, scene.arms[k]
@@ -577,13 +486,12 @@ def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> list[st
             text += f"; crisp leaves them out, and {100.0 * contacts.left_out:.2g} % of the solid"
             if contacts.remaining:
                 text += f", but for {contacts.remaining} without which the arm is cut in two"
-        result.append(f"{text}; {_against_contacts(scene, k, trait.cell_size)}")
+        yield f"{text}; {_against_contacts(scene, k, trait.cell_size)}"
     if rated and run.crisp is None:
         hanging = any(
             trait.contacts.count and not trait.contacts.joins for trait in traits.values()
         )
-        result.append(NO_JOINTS if hanging else FALLS_APART)
-    return result
+        yield NO_JOINTS if hanging else FALLS_APART
 
 
 def _against_contacts(scene: Scene, index: int, size: float) -> str:
@@ -614,22 +522,18 @@ def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
     ]
 
 
-def _warnings(scene: Scene, evaluation: Evaluation) -> list[str]:
-    """Return what makes the figures doubtful, a sentence each: deflections that are not small."""
-    motions: list[tuple[str, Motion]] = [("", evaluation)]
-    for scenario, motion in zip(scene.scenarios, evaluation.scenarios, strict=True):
-        motions.append((f" with {', '.join(scenario.changes)}", motion))
-    warnings = []
-    for where, motion in motions:
+def _large_deflections(scene: Scene, evaluation: Evaluation) -> Iterator[str]:
+    """Yield a sentence on every arm whose deflection is not small, in the scene or a scenario."""
+    changes = ["", *(f" with {', '.join(item.changes)}" for item in scene.scenarios)]
+    for where, motion in zip(changes, (evaluation, *evaluation.scenarios), strict=True):
         for arm, u, turn in zip(scene.arms, motion.deflections, motion.turns, strict=False):
             if u > SMALL or turn > SMALL_TURN:
-                warnings.append(
+                yield (
                     f"arm {arm.name!r} deflects by {100.0 * u:.3g} % of its length and its end "
                     f"turns by {np.degrees(turn):.3g} degrees{where}: beyond {100.0 * SMALL:g} % "
                     f"or {np.degrees(SMALL_TURN):.0f} degrees the model of small deflections is "
                     "inaccurate; stiffen the arm or slow the motion"
                 )
-    return warnings
 
 
 def _reduction(scene: Scene, choice: OrderSelection | None) -> dict[str, Any]:
@@ -648,32 +552,26 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _too_few(scene: Scene, choice: OrderSelection | None) -> list[str]:
-    """Return a sentence where the final design would need more coordinates than were chosen."""
-    if choice is None or choice.error <= scene.reduction.tolerance:
-        return []
-    return [
-        f"with the {choice.coordinates} coordinates that were chosen for the initial design the "
-        f"final one has an estimated error of {choice.error:.2g}, above "
-        f"{scene.reduction.tolerance:g}; optimise with reduction.coordinates = "
-        f"{2 * choice.coordinates}, or a smaller error"
-    ]
+def _too_few(scene: Scene, choice: OrderSelection | None) -> Iterator[str]:
+    """Yield a sentence where the final design would need more coordinates than were chosen."""
+    if choice is not None and choice.error > scene.reduction.tolerance:
+        yield (
+            f"with the {choice.coordinates} coordinates that were chosen for the initial design "
+            f"the final one has an estimated error of {choice.error:.2g}, above "
+            f"{scene.reduction.tolerance:g}; optimise with reduction.coordinates = "
+            f"{2 * choice.coordinates}, or a smaller error"
+        )
 
 
-def _unstiffened(stiffening: Stiffening | None) -> list[str]:
-    """Return a sentence where geometric stiffening is left out and matters."""
-    if stiffening is None or stiffening.on or (stiffening.estimate or 0.0) < STIFFNESS_CHANGE_LIMIT:
-        return []
-    return [
-        f"the loads of the motion change the stiffness of an arm by {stiffening.estimate:.2g} of "
-        "it, which simulation.stiffening = false leaves out; set it to true"
-    ]
-
-
-def _volume(scene: Scene, index: int, arm: Arm) -> float:
-    """Return the volume of all arms with one design, m3."""
-    area = arm.mesh.comm.allreduce(arm.mesh.area.sum())
-    return float(len(arm.places) * scene.arms[index].depth * area)
+def _unstiffened(stiffening: Stiffening | None) -> Iterator[str]:
+    """Yield a sentence where geometric stiffening is left out and matters."""
+    if stiffening is None or stiffening.on:
+        return
+    if (stiffening.estimate or 0.0) >= STIFFNESS_CHANGE_LIMIT:
+        yield (
+            f"the loads of the motion change the stiffness of an arm by {stiffening.estimate:.2g} "
+            "of it, which simulation.stiffening = false leaves out; set it to true"
+        )
 
 
 def _figures(evaluation: Motion) -> dict[str, float]:
@@ -681,16 +579,15 @@ def _figures(evaluation: Motion) -> dict[str, float]:
         "objective": evaluation.objective,
         "compliance": evaluation.compliance,
         "max_deviation": evaluation.max_deviation,
+        "max_deviation_time": evaluation.max_deviation_time,
     }
 
 
 def _slowest(world: MPI.Comm, seconds: Mapping[str, float]) -> dict[str, float]:
     """Return the largest time of any rank by phase."""
-    slowest: dict[str, float] = {}
-    for item in world.allgather(dict(seconds)):
-        for phase, value in item.items():
-            slowest[phase] = max(slowest.get(phase, 0.0), value)
-    return slowest
+    every = world.allgather(dict(seconds))
+    phases = dict.fromkeys(phase for item in every for phase in item)
+    return {phase: max(item.get(phase, 0.0) for item in every) for phase in phases}
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
@@ -718,12 +615,12 @@ def versions() -> dict[str, str]:
 # -- table of the deflection's budget --------------------------------------------------------
 
 
-def budget_of(trajectory: Trajectory | None) -> dict[str, Any] | None:
-    """Return the budget as summary.json has it; None without a motion or a deviation.
+def budget_of(trajectory: Trajectory) -> dict[str, Any] | None:
+    """Return the budget as summary.json has it; None without a deviation.
 
     With feed-forward the joints take the arms' part away: there is nothing to share out.
     """
-    if trajectory is None or trajectory.feed_forward is not None:
+    if trajectory.feed_forward is not None:
         return None
     result = deflection_budget(trajectory)
     return None if result is None else {**asdict(result), "shares": result.shares}

@@ -6,6 +6,8 @@ bilinearly, and with one or two cells across symmetry forbids them to warp at al
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from dolfinopt.dynamics.build import Trajectory
@@ -39,11 +41,11 @@ def torsion_share(body: ShapeIntegrals, q: np.ndarray) -> float:
     return float(torsion / np.einsum("nk,kl,nl->", q, body.K, q))
 
 
-def torsion_warnings(trajectory: Trajectory | None) -> list[str]:
-    """Return a sentence on every arm whose error in torsion counts."""
-    if trajectory is None or trajectory.scene.dimension == 2:
-        return []
-    mechanism, result = trajectory.mechanism, []
+def torsion_warnings(trajectory: Trajectory) -> Iterator[str]:
+    """Yield a sentence on every arm whose error in torsion counts."""
+    if trajectory.scene.dimension == 2:
+        return
+    mechanism = trajectory.mechanism
     for arm, body, part in zip(
         trajectory.scene.arms, mechanism.bodies, mechanism.slices, strict=False
     ):
@@ -54,9 +56,8 @@ def torsion_warnings(trajectory: Trajectory | None) -> list[str]:
             continue
         error, share = torsion_error(*arm.cells[1:]), torsion_share(body, q)
         if error * share > ERROR_LIMIT:
-            result.append(
+            yield (
                 f"arm {arm.name!r}: torsion is {100.0 * share:.0f} % of its strain energy, and "
                 f"{arm.cells[1]} x {arm.cells[2]} cells over its section are too stiff in torsion "
                 f'by {100.0 * error:.2g} %; set element = "quadratic", or use more cells there'
             )
-    return result

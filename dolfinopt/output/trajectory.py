@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,10 @@ from dolfinopt.disk import read_arrays, write_arrays, write_table
 from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import joint_parts
+from dolfinopt.scene.toml import tomllib
 
-BEHIND = "; behind them the bearings', m and rad"
+# Units of summary.json and history.csv by what they are in.
+UNITS = tomllib.loads(Path(__file__).with_name("units.toml").read_text(encoding="utf-8"))
 FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit
 
 if TYPE_CHECKING:
@@ -31,76 +34,86 @@ def write_trajectory(
             picture.
     """
     trajectory = trajectory.sampled
-    arrays = {
-        "t": trajectory.t,
-        "q_r": trajectory.q_r,
-        "q_e": trajectory.q_e,
-        "deviation": trajectory.deviation,
-        "compliance": trajectory.compliance,
-        "joint_forces": trajectory.joint_forces,
-        "rotation": _rotation(trajectory),
-    } | _of_machine(trajectory)
-    scene = trajectory.scene
+    scene, blocks = trajectory.scene, list(_blocks(trajectory))
+    arrays = {name: values for name, values, _ in blocks if name}
+    units = {name: list(own.values()) for name, _, own in blocks if name}
+    arrays["joint_forces"] = trajectory.joint_forces
+    units["joint_forces"] = [FORCE_OF[unit] for unit in scene.rigid_units.values()]
     if initial is not None and len(initial):
         even = np.linspace(scene.lead, scene.horizon, len(initial))
         arrays["initial_deviation"] = _between(even, initial, trajectory.t)
-    rigid, bearings = ", ".join(scene.rigid_units.values()), trajectory.mechanism.bearings
-    units = {
-        "t": "s",
-        "q_r": rigid,
-        "q_r_desired": rigid,
-        "q_motors": ", ".join(_motor_units(trajectory).values()),
-        "q_e": "m or rad: times V is a displacement in m" + BEHIND * bool(bearings),
-        "deviation": "m",
-        "compliance": "N m",
-        "joint_forces": ", ".join(FORCE_OF[unit] for unit in scene.rigid_units.values()),
-        "closure_force": ", ".join(_closure_units(scene).values()),
-        "slider_position": "m, from closures.point along closures.axis",
-        "rotation": "rad",
-        "initial_deviation": "m",
-    }
-    arrays["units"] = np.array([f"{name}: {units[name]}" for name in arrays])
+        units["initial_deviation"] = ["m"]
+    # One unit where all columns have the same.
+    stated = {name: ", ".join(own if len(set(own)) > 1 else own[:1]) for name, own in units.items()}
+    arrays["units"] = np.array([f"{name}: {unit}" for name, unit in stated.items()])
     write_arrays(folder / "trajectory.npz", arrays)
-    header = list(trajectory_units(trajectory))
-    write_table(folder / "trajectory.csv", header, _columns(trajectory), 10)
+    header = [column for _, _, own in blocks for column in own]
+    write_table(folder / "trajectory.csv", header, [values for _, values, _ in blocks], 10)
 
 
-def _of_machine(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Return what there is beside a prescribed motion: desired coordinates, the closure's force."""
-    arrays = {}
+Block = tuple[str, np.ndarray, dict[str, str]]
+
+
+def _blocks(trajectory: Trajectory) -> Iterator[Block]:
+    """Yield the columns of trajectory.csv in their order.
+
+    Blocks of them: the name in trajectory.npz, "" where they are not there as they are; values (n,)
+    or (n, k); units by column.
+    """
+    scene, rigid, axes = trajectory.scene, trajectory.scene.rigid_units, "xyz"
+    places = list(rigid.items())
+
+    def named(prefix: str, units: Mapping[str, str]) -> dict[str, str]:
+        return {f"{prefix}_{name}": unit for name, unit in units.items()}
+
+    yield "t", trajectory.t, {"t": "s"}
+    along = dict.fromkeys(axes[: scene.dimension], "m")
+    yield "deviation", trajectory.deviation, named("deviation", along)
+    yield "", trajectory.distance, {"deviation": "m"}
+    yield "", trajectory.compliance.sum(axis=1), {"compliance": "N m"}
+    yield "q_r", trajectory.q_r, named("q_r", rigid)
+    yield "q_e", trajectory.q_e, _elastic_units(trajectory)
+    by_arm = dict.fromkeys((arm.name for arm in scene.arms), "N m")
+    yield "compliance", trajectory.compliance, named("compliance", by_arm)
+    driven = trajectory.joint_forces[:, scene.driven_columns]
+    yield "", driven, named("joint_force", drive_units(scene))
     if trajectory.is_machine:
-        arrays["q_r_desired"] = trajectory.desired.q
+        yield "q_r_desired", trajectory.desired.q, named("q_r_desired", rigid)
     if trajectory.motors is not None:
-        arrays["q_motors"] = trajectory.motors
-    if trajectory.closure_force is not None:
-        arrays["closure_force"] = trajectory.closure_force
-    if trajectory.slider_position is not None:
-        arrays["slider_position"] = trajectory.slider_position
-    return arrays
-
-
-def _rotation(trajectory: Trajectory) -> np.ndarray:
-    """Return the end-effector's rotation: of the plane an angle (n,), of space vectors (n, 3)."""
+        motors = dict(places[k] for k in trajectory.problem.motor_joints)
+        yield "q_motors", trajectory.motors, named("q_motor", motors)
+    if (force := trajectory.closure_force) is not None:
+        name = "closure_force"
+        if trajectory.closure is not None:  # also under its own name
+            parts = dict(scene.closures[0].parts(scene.dimension))
+            yield name, force, named(name, parts)
+            name = ""
+        if trajectory.slider_position is not None:
+            yield "slider_position", trajectory.slider_position, {"slider_position": "m"}
+        yield name, force, _closure_units(scene)
     rotation = trajectory.rotation
-    return rotation[:, 0] if rotation.shape[1] == 1 else rotation
+    if rotation.shape[1] == 1:  # in the plane
+        yield "rotation", rotation[:, 0], {"rotation": "rad"}
+    else:
+        yield "rotation", rotation, named("rotation", dict.fromkeys(axes, "rad"))
 
 
-def _columns(trajectory: Trajectory) -> list[np.ndarray]:
-    """Return the columns of trajectory.csv, see `trajectory_units`."""
-    arrays = _of_machine(trajectory)
-    return [
-        trajectory.t,
-        trajectory.deviation,
-        trajectory.distance,
-        trajectory.compliance.sum(axis=1),
-        trajectory.q_r,
-        trajectory.q_e,
-        trajectory.compliance,
-        trajectory.joint_forces[:, trajectory.scene.driven_columns],
-        *arrays.values(),
-        *([arrays["closure_force"]] if trajectory.closure is not None else []),
-        trajectory.rotation,
-    ]
+def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
+    """Return the unit of every column of trajectory.csv, in their order."""
+    return {column: unit for _, _, units in _blocks(trajectory) for column, unit in units.items()}
+
+
+def _elastic_units(trajectory: Trajectory) -> dict[str, str]:
+    """Return the unit of every elastic coordinate by its column, and of every bearing's."""
+    scene, mechanism = trajectory.scene, trajectory.mechanism
+    units: dict[str, str] = {}
+    for arm, part in zip(scene.arms, mechanism.slices):
+        # Of normalised modes: a unit of their own, which times the mode is a displacement.
+        units |= {f"q_e_{arm.name}_{k + 1}": "modal" for k in range(part.stop - part.start)}
+    for place, body in zip(mechanism.bearings, mechanism.bodies[mechanism.num_arms :], strict=True):
+        name = scene.joint_names[place]
+        units |= {f"q_bearing_{name}_{along}": unit for along, unit in moves(body)}
+    return units
 
 
 def drive_units(scene: Scene) -> dict[str, str]:
@@ -118,40 +131,6 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
     soft = {names[k] for k, item in pairs if k is not None and item.stiffness > 0.0}
     soft |= {rod.name for rod in scene.rods if rod.is_spring}
     return tuple(name for name in scene.driven if name in soft)
-
-
-def _motor_units(trajectory: Trajectory) -> dict[str, str]:
-    """Return the unit of every motor's coordinate behind a gear by its joint's name."""
-    units = list(trajectory.scene.rigid_units.items())
-    return dict(units[k] for k in trajectory.problem.motor_joints)
-
-
-def trajectory_units(trajectory: Trajectory) -> dict[str, str]:
-    """Return the unit of every column of trajectory.csv, in their order."""
-    scene, slices = trajectory.scene, trajectory.mechanism.slices
-    axes = "xyz"[: scene.dimension]
-    units = {"t": "s", **{f"deviation_{axis}": "m" for axis in axes}, "deviation": "m"}
-    units |= {"compliance": "N m"}
-    units |= {f"q_r_{name}": unit for name, unit in scene.rigid_units.items()}
-    for arm, part in zip(scene.arms, slices):
-        # Of normalised modes: a unit of their own, which times the mode is a displacement.
-        units |= {f"q_e_{arm.name}_{k + 1}": "modal" for k in range(part.stop - part.start)}
-    mechanism = trajectory.mechanism
-    for place, body in zip(mechanism.bearings, mechanism.bodies[mechanism.num_arms :], strict=True):
-        name = scene.joint_names[place]
-        units |= {f"q_bearing_{name}_{along}": unit for along, unit in moves(body)}
-    units |= {f"compliance_{arm.name}": "N m" for arm in scene.arms}
-    units |= {f"joint_force_{name}": unit for name, unit in drive_units(scene).items()}
-    if trajectory.is_machine:
-        units |= {f"q_r_desired_{name}": unit for name, unit in scene.rigid_units.items()}
-        units |= {f"q_motor_{name}": unit for name, unit in _motor_units(trajectory).items()}
-    if trajectory.closure is not None:
-        parts = scene.closures[0].parts(scene.dimension)
-        units |= {f"closure_force_{part}": unit for part, unit in parts}
-        units |= {} if trajectory.slider_position is None else {"slider_position": "m"}
-    units |= _closure_units(scene)
-    ends = [""] if trajectory.mechanism.dim.r == 1 else [f"_{axis}" for axis in axes]
-    return units | {f"rotation{end}": "rad" for end in ends}
 
 
 def _closure_units(scene: Scene) -> dict[str, str]:

@@ -32,7 +32,7 @@ from dolfinopt.scene.load import Scene, tomllib
 from dolfinopt.study import studies, variants
 from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
 from dolfinopt.study.studies import QUANTITIES
-from dolfinopt.study.tables import Figure, LineFigure, Table, embedded, html_page
+from dolfinopt.study.tables import Figure, LineFigure, Table, html_page
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -298,7 +298,7 @@ def write_report(
 
     files = draw_all({name: item for name, (item, _) in figures.items()}, folder)
     pictures = [
-        (int(name[3:]), item.title, embedded(file.read_bytes()))
+        (int(name[3:]), item.title, file.read_bytes())
         for (name, (item, _)), file in zip(figures.items(), files, strict=True)
     ]
     tables = [data for _, data in figures.values() if isinstance(data, Table)]

@@ -58,19 +58,6 @@ class Curves:
 DEFAULTS = Curves()
 
 
-class PartsError(InputError):
-    """Some arms have no part; `parts` are those of the others, by their place in the chain."""
-
-    parts: Mapping[int, Part]
-
-    def __init__(self, message: str, parts: Mapping[int, Part]) -> None:
-        super().__init__(message)
-        self.parts = parts
-
-    def __reduce__(self) -> tuple[type[InputError], tuple[str]]:
-        return InputError, (str(self),)  # on other ranks, which have none
-
-
 def make_parts(
     scene: Scene, folder: Path, curves: Curves | None = None, world: MPI.Comm | None = None
 ) -> dict[int, Part]:
@@ -88,10 +75,8 @@ def make_parts(
         Parts by their place in the chain, on the root; none elsewhere.
 
     Raises:
-        InputError: no design in the folder, or one that does not fit the scene's arms; on all
-            ranks.
-        PartsError: no part can be made of some arm with these values; on the root, elsewhere its
-            InputError.
+        InputError: no design in the folder, one that does not fit the scene's arms, or one of
+            which no part can be made with these values; on all ranks.
     """
     from mpi4py import MPI
 
@@ -125,7 +110,7 @@ def make_parts(
     with together(world):
         if len(parts) < len(results):
             failed = [str(part) for part in results.values() if isinstance(part, InputError)]
-            raise PartsError("; ".join(failed), parts)
+            raise InputError("; ".join(failed))
     return parts
 
 

@@ -223,9 +223,10 @@ def draw_motion(path: PathLike, views: Sequence[ArmView], film: Film) -> Path:
         draw = frame_drawer(drawn, film)
         # A palette of each frame's own would take longer to find than the frame to draw, and would
         # let the colours flicker.
-        palette = Image.new("P", (1, 1))
-        samples = np.stack([draw(k) for k in (0, count // 2, count - 1)])
-        palette.putpalette(common_colours(samples).tobytes())
+        samples = np.concatenate([draw(k) for k in (0, count // 2, count - 1)])
+        palette = Image.fromarray(samples).quantize(
+            FILM_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE
+        )
         first, *others = (
             Image.fromarray(draw(k)).quantize(palette=palette, dither=Image.Dither.NONE)
             for k in range(count)
@@ -281,15 +282,3 @@ def frame_drawer(drawn: Stage, film: Film) -> Callable[[int], np.ndarray]:
         return np.array(canvas.buffer_rgba())[:, :, :3]
 
     return draw
-
-
-def common_colours(pictures: np.ndarray) -> np.ndarray:
-    """Return the most frequent colours (128, 3) of pictures (..., 3), uint8, the first most.
-
-    They are told apart by 32 levels a channel. Pillow's own palettes make white grey, or grey blue.
-    """
-    codes = np.round(pictures.reshape(-1, 3) * (31.0 / 255.0)).astype(int) @ [1024, 32, 1]
-    counts = np.bincount(codes, minlength=32**3)
-    chosen = np.argsort(-counts, kind="stable")[:FILM_COLOURS]
-    levels = np.stack([chosen // 1024, chosen // 32 % 32, chosen % 32], axis=1)
-    return np.round(levels * (255.0 / 31.0)).astype(np.uint8)

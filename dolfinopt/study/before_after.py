@@ -19,7 +19,7 @@ from dolfinopt.output.trajectory import drive_units
 from dolfinopt.plots.panels import Line, Panel, panel_figure
 from dolfinopt.plots.style import look
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.tables import Table, embedded, html_page
+from dolfinopt.study.tables import Table, html_page
 from dolfinopt.study.variants import differences
 
 if TYPE_CHECKING:
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from dolfinopt.output.design import ArmView
 
 Summary = Mapping[str, Any]  # content of summary.json
-Image = dict[str, Any]  # see `tables.embedded`
 BEFORE, AFTER = "before", "after"
 LOOKS = {BEFORE: look(1), AFTER: look(0)}  # as an initial and an optimised design
 
@@ -154,7 +153,7 @@ def before_after_page(
     for label, side in sides.items():
         still = np.zeros((len(side.t), side.mechanism.num_coordinates))
         poses = body_poses(side.mechanism, side.q_r, still)
-        machines.append((label, _embedded(poses_figure(side.views, poses, side.t, label))))
+        machines.append((label, _png(poses_figure(side.views, poses, side.t, label))))
     return html_page(
         "before_after.html",
         title=table.title,
@@ -173,7 +172,7 @@ def before_after_page(
     )
 
 
-def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
+def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, bytes]]:
     """Yield every link that one of the runs designs, by its name: both to one scale."""
     from dolfinopt.plots.design import design_figure
 
@@ -181,10 +180,10 @@ def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
     for name in dict.fromkeys(view.name for _, view in result):
         views = [replace(view, name=label) for label, view in result if view.name == name]
         masses = {view.name: sides[view.name].summary["mass"][name] for view in views}
-        yield name, _embedded(design_figure(views, name, masses))
+        yield name, _png(design_figure(views, name, masses))
 
 
-def _curves(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
+def _curves(sides: Mapping[str, Side]) -> Iterator[tuple[str, bytes]]:
     """Yield title and picture of deflection and drive forces over time."""
     deflections = {label: 1e3 * side.deviation for label, side in sides.items()}
     yield _plot(sides, "deflection of the tool", "deflection of the tool [mm]", deflections)
@@ -196,15 +195,15 @@ def _curves(sides: Mapping[str, Side]) -> Iterator[tuple[str, Image]]:
 
 def _plot(
     sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]
-) -> tuple[str, Image]:
+) -> tuple[str, bytes]:
     """Return curves of both runs over time, and their title."""
     lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
     panel = Panel(title, "time [s]", label, lines, y_log=False)
-    return title, _embedded(panel_figure("", [[panel]], LOOKS))
+    return title, _png(panel_figure("", [[panel]], LOOKS))
 
 
-def _embedded(figure: Figure) -> Image:
+def _png(figure: Figure) -> bytes:
     """Return a figure as a picture of the page."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png")
-    return embedded(stream.getvalue())
+    return stream.getvalue()

@@ -34,19 +34,17 @@ from dolfinopt.disk import make_folder, write_arrays, write_text
 from dolfinopt.dynamics.build import Trajectory, simulate_all
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.multibody.kinematics import lengths
-from dolfinopt.optimization.result import RankResult, simulation_result
+from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import arms_with_design, read_history, under_law_of
 from dolfinopt.output.folders import working_alone
-from dolfinopt.output.run_folder import optimize, write_result
+from dolfinopt.output.run_folder import optimize, simulated, write_result
 from dolfinopt.output.summary import figures, versions, write_summary
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Counts, Profile
 from dolfinopt.progress import log
-from dolfinopt.responses.evaluation import evaluate
 from dolfinopt.responses.motion import worst_instants
-from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import bodies_in
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, program, with_digests
@@ -260,16 +258,13 @@ def simulate_scenarios(
     where one does not fit the arms.
     """
     profile = Profile()
-    partition, arms, x_phys = arms_with_design(MPI.COMM_SELF, scenes[0], design, profile)
+    designed = arms_with_design(MPI.COMM_SELF, scenes[0], design, profile)
     for given in scenes:
         scene = under_law_of(given, design)
-        arms = {k: arm.under(scene) for k, arm in arms.items()}
-        place = scene, partition, arms, x_phys
+        arms = {k: arm.under(scene) for k, arm in designed.arms.items()}
+        designed = designed._replace(scene=scene, arms=arms)
         try:
-            choice = choose_coordinates(*place, profile)
-            result: RankResult | ConvergenceError = simulation_result(
-                *place, *evaluate(*place, profile), profile, choice
-            )
+            result: RankResult | ConvergenceError = simulated(designed, profile)
         except ConvergenceError as error:
             result = error
         yield result
@@ -376,7 +371,7 @@ class _Place:
             result["samples"] = {name: np.array(values, float) for name, values in samples.items()}
             result["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
         elif not failed:
-            result |= {name: data[name] for name in FIGURES}
+            result |= {name: data[name] for name in FIGURES if name in data}
         if not failed:
             result["seconds"] = data["seconds"]["total"]
         return Outcome(case, self[case], **result)

@@ -101,9 +101,7 @@ def matrix_figure(figure: FrameFigure) -> Figure:
         axes.set_xticks(range(count), part[made_for])
         axes.set_yticks(range(count), part[made_for])
         _label(axes, title, made_for.replace("made for", "used at", 1), made_for)
-        ends = {(False, False): "neither", (True, False): "min", (False, True): "max"}
-        beyond = bool(np.any(values < -LOSS)), bool(np.any(values > LOSS))
-        drawn.colorbar(image, ax=axes, shrink=0.8, extend=ends.get(beyond, "both"))
+        drawn.colorbar(image, ax=axes, shrink=0.8, extend="both")
     return drawn
 
 
@@ -127,9 +125,7 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
             _label(axes, design, what, "samples [-]")
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             share = axes.twinx()
-            share.step(np.sort(values), np.arange(1, len(values) + 1) / len(values), where="post",
-                       color=GREY)  # fmt: skip
-            share.set_ylim(0.0, 1.0)
+            share.ecdf(values, color=GREY)
             share.set_ylabel("share of samples below [-]", color=GREY)
     return drawn
 

@@ -17,17 +17,16 @@ import numpy as np
 import pandas as pd
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import Arm, chain_of
+from dolfinopt.arms.arm import chain_of
 from dolfinopt.disk import make_folder, write_table
 from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
-from dolfinopt.output.design import arms_with_design
+from dolfinopt.output.design import Designed, arms_with_design
 from dolfinopt.output.feed_forward import finer_deviation, simulated_with, with_feed_forward
-from dolfinopt.parallel import Partition
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.cases import Case, Outcome, Steps
-from dolfinopt.study.studies import DEVIATION, deviation_panels, single_design
+from dolfinopt.study.studies import DEVIATION, deviation_panels, results_of, single_design
 from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "motions"  # of the study's files, and of the folder of the shaped joints
@@ -42,10 +41,6 @@ SHAPERS: dict[ShaperKind, str] = {
 KEPT = ("base", "cart_mass", "joint_height", "gravity", "initial_joints")
 ROWS = 2000  # of a table of shaped joints
 TEN_PERCENT, FIVE_PERCENT = 1.1, 0.95
-
-Place = tuple[
-    Partition, dict[int, Arm], dict[int, np.ndarray]
-]  # of a design, see `arms_with_design`
 
 
 class Motion(NamedTuple):
@@ -110,11 +105,9 @@ def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list
     rigid, forward = (_judged(with_feed_forward(scene, kind)) for kind in ("none", "tip"))
     first = designs[0]
     place = arms_with_design(MPI.COMM_SELF, rigid, first, Profile())
-    finer = _finer_deviation(rigid, place)
-    motions = [Motion(Case(rigid, "simulate", first, RIGID), finer=finer)]
-    _, arms, x_phys = place
-    bodies = chain_of(rigid, {index: arm.reduce(x_phys[index]) for index, arm in arms.items()})
-    frequency, damping_ratio = build_system(rigid, bodies).slowest_vibration(2)
+    motions = [Motion(Case(rigid, "simulate", first, RIGID), finer=_finer_deviation(place))]
+    bodies = {index: arm.reduce(place.x_phys[index]) for index, arm in place.arms.items()}
+    frequency, damping_ratio = build_system(rigid, chain_of(rigid, bodies)).slowest_vibration(2)
     if frequency > 0.0 and scene.motion.table_ends == "rest":
         for kind, label in SHAPERS.items():
             shaper = input_shaper(kind, frequency, damping_ratio)
@@ -123,7 +116,7 @@ def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list
     for label, design in zip((FORWARD, DESIGNED), designs, strict=False):
         place = arms_with_design(MPI.COMM_SELF, forward, design, Profile())
         case = Case(forward, "simulate", design, label)
-        motions.append(Motion(case, 2.0 * forward.lead, _finer_deviation(forward, place)))
+        motions.append(Motion(case, 2.0 * forward.lead, _finer_deviation(place)))
     return motions
 
 
@@ -134,17 +127,18 @@ def _judged(scene: Scene) -> Scene:
     return scene_from_dict(data, scene.source)
 
 
-def _finer_deviation(scene: Scene, place: Place) -> float | None:
+def _finer_deviation(place: Designed) -> float | None:
     """Return the largest deviation in a finer model with this one's corrections, m."""
+    scene = place.scene
     if not scene.reduction.count:
         return None
     corrections = None
     if scene.feed_forward.on:
-        nominal = simulated_with(scene, *place)
+        nominal = simulated_with(place)
         if nominal is None:
             return None
         corrections = nominal.feed_forward
-    return finer_deviation(scene, *place, corrections)
+    return finer_deviation(place, corrections)
 
 
 def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
@@ -199,14 +193,14 @@ def _verdict(able: Sequence[Outcome]) -> str:
 
 def _cells(scene: Scene, motion: Motion, outcome: Outcome) -> dict[str, Any]:
     """Return a row by column."""
-    summary = outcome.summary()
+    summary, known = outcome.summary(), results_of(outcome)
     cells: dict[str, Any] = {
         "motion": motion.case.label,
-        "mass [kg]": summary.get("designed_mass", math.nan),
+        "mass [kg]": known["mass [kg]"],
         "longer by [s]": motion.longer,
-        DEVIATION: 1e3 * outcome.max_deviation,
+        DEVIATION: known[DEVIATION],
         "finer model [mm]": math.nan if motion.finer is None else 1e3 * motion.finer,
-        "settling [mm]": 1e3 * summary.get("settling", math.nan),
+        "settling [mm]": known["settling [mm]"],
     }
     for name, result in zip(machines(scene), summary.get("scenarios", ()), strict=False):
         cells[f"{name} [mm]"] = 1e3 * result["max_deviation"]

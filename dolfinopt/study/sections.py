@@ -5,9 +5,9 @@ scene has limits, as light as they allow. A member is a scene of its own, with s
 mesh lies in DIR/sections; it is simulated, judged and kept like any other case.
 
 The lightest members are found by their shares s of the most material that the envelope takes. Each
-limited value is taken for a power law of them, v = v0 prod_k s_k^a_k, with a from one simulation
-an arm; the mass is least where these hold their limits, and one factor of all shares then puts the
-members on the limit itself.
+limited value is taken for a sum of power laws, v = v0 (1 + sum_k a_k / p ((s_k / s_0k)^p - 1)) with
+p = sum_k a_k and a from one simulation an arm; the next members are those whose mass is least where
+these hold their limits, and so on.
 """
 
 from __future__ import annotations
@@ -53,12 +53,11 @@ VARIED = {
     3: "Tubes and the I have the outer sides of the arm's envelope, their walls are what varies (a "
     f"share of {LEAST:g} to {MOST:g} of the largest); walls may buckle, which is not judged.",
 }
-NEAREST, FARTHEST = 0.01, 0.5  # steps of the factor's logarithm to the other side of a limit
-CLOSE = 1e-6  # of the same: both sides are one
-STEPS = 20  # simulations at most on the way to a limit
+STEPS = 20  # sets of power laws at most
 STEP = 0.03  # relative change of a share from which the exponents are told
-MOVE, LEAST_MOVE = 0.25, 0.1  # largest change of ln s by one set of power laws, at first and last
-WORTH = 3e-3  # relative gain of mass below which the next set moves less
+MOVE = 1.0  # largest change of ln s by one set of power laws, halved where they do not hold
+WORTH = 3e-3  # relative gain of mass below which the search ends
+PENALTY = 10.0  # of a relative excess over a relative mass: frequencies take most, m^2 and more
 SLIGHT = 0.01  # relative excess of a limit by the design up to which it is told, but no defeat
 # Judged by mass alone where these are all that is limited: they fall with the material.
 OF_MATERIAL = ("volume_fraction", "mass")
@@ -108,10 +107,6 @@ class Members:
     def most(self) -> float:
         """The largest share."""
         return MOST if self.section.plane is not None else 1.0
-
-    def scaled(self, shares: Shares, x: float) -> Shares:
-        """Return the shares times exp(x), within the bounds."""
-        return tuple(round(min(max(math.exp(x) * s, LEAST), self.most), 9) for s in shares)
 
     def of_mass(self, masses: Mapping[str, float]) -> Shares | None:
         """Return the shares with which every arm has its mass, kg; None where one cannot."""
@@ -182,18 +177,24 @@ def _bar_cells(length: float, height: float, thickness: float, solid: bool) -> t
 
 
 def limited(outcome: Outcome) -> dict[str, float]:
-    """Return ln(1 + excess) of every limit that material helps to hold; <= 0 where it is held."""
+    """Return ln(value / limit) of every limit that material helps to hold; <= 0 where it is held.
+
+    Of lower limits ln(limit / value).
+    """
     return {
-        name: math.log(max(1e-9, 1.0 + _excess(limit)))
+        name: math.log(max(1e-9, limit["value"] / limit["limit"])) * _sign(limit)
         for name, limit in outcome.summary().get("constraints", {}).items()
         if not name.startswith(OF_MATERIAL)
     }
 
 
+def _sign(limit: Mapping[str, Any]) -> float:
+    return -1.0 if limit["bound"] == "least" else 1.0
+
+
 def _excess(limit: Mapping[str, Any]) -> float:
     """Return the relative violation of an entry of a summary's constraints."""
-    gap = limit["value"] / limit["limit"] - 1.0
-    return float(-gap if limit["bound"] == "least" else gap)
+    return float(_sign(limit) * (limit["value"] / limit["limit"] - 1.0))
 
 
 def lightest(members: Members) -> Steps[Found]:
@@ -203,75 +204,41 @@ def lightest(members: Members) -> Steps[Found]:
         Shares, and whether they hold; of members that do not, those that come nearest. None where
         no simulation succeeded.
     """
-    count, move = len(members.arms), MOVE
-    result = yield from _on_limit(members, (members.most,) * count)
-    if result is None or not result[1]:
-        return result
-    best = result[0]
-    while count > 1 and move >= LEAST_MOVE:
-        stepped = [_stepped(members, best, k) for k in range(count)]
-        cases = [members.case(shares) for shares in (best, *stepped)]
+    shares, move = (members.most,) * len(members.arms), MOVE
+    case = members.case(shares)
+    base = limited((yield [case])[case])
+    tried = {shares: _largest(base)}
+    for _ in range(STEPS if base else 0):
+        stepped = [_stepped(members, shares, k) for k in range(len(shares))]
+        cases = [members.case(item) for item in stepped]
         done = yield cases
-        balanced = _balanced(members, best, stepped, [done[case] for case in cases], move)
-        result = yield from _on_limit(members, balanced)
-        gain = 0.0
-        if result is not None and result[1]:
-            gain = 1.0 - members.total_mass(result[0]) / members.total_mass(best)
-            best = result[0] if gain > 0.0 else best
-        if gain < WORTH:  # the power laws hold over less than that, or there is no more to gain
+        after = _balanced(members, shares, base, stepped, [limited(done[x]) for x in cases], move)
+        case = members.case(after)
+        excesses = limited((yield [case])[case])
+        tried[after] = _largest(excesses)
+        gain = _merit(members, shares, tried) - _merit(members, after, tried)
+        is_decided = tried[after] > EXCESS or -EXCESS < tried[after] <= 0.0
+        if after == shares or (abs(gain) < WORTH and is_decided):
+            break
+        if gain > 0.0:
+            shares, base = after, excesses
+        else:  # the power laws hold over less than that
             move *= 0.5
-    return best, True
+    holding = [item for item, excess in tried.items() if excess <= 0.0]
+    if holding:
+        return min(holding, key=members.total_mass), True
+    nearest = min(tried, key=lambda item: tried[item])
+    return (nearest, False) if math.isfinite(tried[nearest]) else None
 
 
-def _on_limit(members: Members, shares: Shares) -> Steps[Found]:
-    """Search the least factor of all shares with which the members hold the limits."""
-    low, high = math.log(LEAST / max(shares)), math.log(members.most / min(shares))
-    excess: dict[float, float] = {}
-    x: float | None = 0.0
-    while x is not None and len(excess) < STEPS:
-        case = members.case(members.scaled(shares, x))
-        outcome = (yield [case])[case]
-        failed = bool(outcome.failure)
-        excess[x] = math.inf if failed else max(limited(outcome).values(), default=math.inf)
-        x = _next(excess, low, high)
-    held = [at for at, value in excess.items() if value <= 0.0]
-    if held:
-        return members.scaled(shares, min(held)), True
-    nearest = min(excess, key=lambda at: excess[at])
-    return (members.scaled(shares, nearest), False) if math.isfinite(excess[nearest]) else None
+def _largest(excesses: Mapping[str, float]) -> float:
+    """Return the largest excess; of members that cannot be simulated infinity."""
+    return max(excesses.values(), default=math.inf)
 
 
-def _next(excess: Mapping[float, float], low: float, high: float) -> float | None:
-    """Return where to look next for the least x within the limits, by ln(1 + excess) so far."""
-    first, most = min(excess), max(excess)
-    up = min((at for at, value in excess.items() if value <= 0.0), default=None)
-    if up is None:  # upwards, and from the most that there is down while that helps
-        if most < high:
-            return min(most + _stride(excess[most]), high)
-        helps = excess[first] <= min(excess.values())
-        return max(first - _stride(excess[first]), low) if helps and first > low else None
-    if excess[up] >= -EXCESS or up == low:
-        return None
-    if up == first:
-        return max(up - _stride(excess[up]), low)
-    down = max(at for at in excess if at < up)
-    if up - down < CLOSE:
-        return None
-    if not math.isfinite(excess[down]):
-        return 0.5 * (up + down)
-    # The secant of the last two, to half the tolerance below the limit: there the limit is held.
-    before, last = list(excess)[-2:]
-    fall = excess[before] - excess[last]
-    if math.isfinite(fall) and fall != 0.0:
-        x = last + (last - before) * (excess[last] + 0.5 * EXCESS) / fall
-        if down < x < up:
-            return x
-    return 0.5 * (up + down)
-
-
-def _stride(excess: float) -> float:
-    """Return how far x has to go to the limit or beyond: values fall with 1 / s or more steeply."""
-    return min(FARTHEST, max(NEAREST, 1.1 * abs(excess)))
+def _merit(members: Members, shares: Shares, tried: Mapping[Shares, float]) -> float:
+    """Return the logarithm of the mass, and what limits are exceeded by, which weighs more."""
+    return math.log(members.total_mass(shares)) + PENALTY * max(0.0, tried[shares])
 
 
 def _stepped(members: Members, shares: Shares, k: int) -> Shares:
@@ -284,41 +251,36 @@ def _stepped(members: Members, shares: Shares, k: int) -> Shares:
 def _balanced(
     members: Members,
     shares: Shares,
+    base: Mapping[str, float],
     stepped: Sequence[Shares],
-    outcomes: Sequence[Outcome],
+    changed: Sequence[Mapping[str, float]],
     move: float,
 ) -> Shares:
-    """Return the shares of least mass by the power laws through the outcomes."""
-    # The first is of the shares to set out from, the others of `stepped`, with one arm's changed;
-    # `move` is the largest change of a share's logarithm.
-    base, *changed = map(limited, outcomes)
+    """Return the shares of least mass by the power laws through the excesses `base`, `changed`.
+
+    The latter are of `stepped`, with one arm's share changed each; `move` is the largest change of
+    a share's logarithm.
+    """
     names = [name for name in base if all(name in excesses for excesses in changed)]
-    if not names:
-        return shares
-    start = np.log(shares)
-    steps = [math.log(after[k] / shares[k]) for k, after in enumerate(stepped)]
-    slopes = np.array(
-        [
-            [(after[name] - base[name]) / step for after, step in zip(changed, steps, strict=True)]
-            for name in names
-        ]
-    )
-    values = np.array([base[name] for name in names])
-    total = members.total_mass(shares)
+    values, start, steps = np.array([base[name] for name in names]), np.log(shares), np.log(stepped)
+    after = np.array([[excesses[name] for name in names] for excesses in changed])
+    slopes = (after - values) / np.diag(steps - start)[:, None]  # (arms, limits)
+    exponent = slopes.sum(axis=0) + 1e-9
+
+    def room(z: np.ndarray) -> np.ndarray:
+        parts = slopes / exponent * np.expm1(np.outer(z[:-1] - start, exponent))
+        return 1.0 - 0.5 * EXCESS + z[-1] - np.exp(values) * (1.0 + parts.sum(axis=0))
+
     low, high = math.log(LEAST), math.log(members.most)
     bounds = [(max(low, x - move), min(high, x + move)) for x in start]
-    result = minimize(
-        lambda x: members.total_mass(tuple(np.exp(x))) / total,
-        start,
+    result = minimize(  # x, and what is beyond half of the tolerance below the limits
+        lambda z: math.log(members.total_mass(tuple(np.exp(z[:-1])))) + PENALTY * z[-1],
+        [*start, 0.0],
         method="SLSQP",
-        bounds=bounds,
-        constraints={
-            "type": "ineq",
-            "fun": lambda x: -(values + slopes @ (x - start)),
-            "jac": lambda x: -slopes,
-        },
+        bounds=[*bounds, (0.0, None)],
+        constraints={"type": "ineq", "fun": room},
     )
-    return tuple(float(share) for share in np.exp(result.x)) if result.success else shares
+    return tuple(round(float(share), 9) for share in np.exp(result.x[:-1]))
 
 
 # -- the study -------------------------------------------------------------------------------

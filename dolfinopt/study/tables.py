@@ -144,10 +144,5 @@ def joined(*parts: str) -> str:
 
 def html_page(template: str, **content: Any) -> str:
     """Return a page, see `data.filled`: one file, pictures inside, so that it opens anywhere."""
-    return filled(template, {}, as_text=as_text, **content).strip()
-
-
-def embedded(data: bytes) -> dict[str, Any]:
-    """Return a PNG as a page's macro `image` takes it."""
-    width, height = (int.from_bytes(data[i : i + 4], "big") for i in (16, 20))  # of its header
-    return {"data": base64.b64encode(data).decode(), "width": width, "height": height}
+    filters = {"base64": lambda png: base64.b64encode(png).decode()}
+    return filled(template, filters, as_text=as_text, **content).strip()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -163,10 +162,8 @@ def unit_points(count: int, dimensions: int, seed: int) -> np.ndarray:
 
     Owen's scrambling of Sobol's sequence; more of them begin with the same ones.
     """
-    with warnings.catch_warnings():
-        # Numbers that are no power of two are a little less even, and no error.
-        warnings.filterwarnings("ignore", "The balance properties", UserWarning)
-        return qmc.Sobol(dimensions, seed=seed).random(count)
+    power = math.ceil(math.log2(count))  # of two points are the most even
+    return qmc.Sobol(dimensions, seed=seed).random_base2(power)[:count]
 
 
 def draw(distributions: Sequence[Distribution], points: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,26 +19,12 @@ from dolfinopt.scene.messages import model_at, unit_of
 from dolfinopt.scene.old_words import in_new_words
 from dolfinopt.scene.schema import flattened
 from dolfinopt.scene.tables.responses import DECLARED, unused_options
+from dolfinopt.scene.toml import tomllib
 
-# Label; kind, and the settings that make it.
-OBJECTIVES = (
-    ("dynamic loads (esl)", ("esl", "gradient=esl")),
-    ("dynamic loads (esl), exact gradient", ("esl", "gradient=exact")),
-    ("compliance over the horizon", ("integral_compliance", "gradient=esl")),
-    ("compliance over the horizon, exact gradient", ("integral_compliance", "gradient=exact")),
-    ("deviation", ("deviation", "gradient=esl")),
-    ("deviation, exact gradient", ("deviation", "gradient=exact")),
-    ("static compliance", ("static",)),
-    ("eigenfrequency, rigid bodies attached", ("eigenfrequency", "attached=rigid-body")),
-    ("eigenfrequency, point masses attached", ("eigenfrequency", "attached=point-mass")),
-    ("eigenfrequency, nothing attached", ("eigenfrequency", "attached=none")),
-)
-# Those that a comparison adds to the paper's.
-RESPONSES = (
-    ("settling", ("settling",)),
-    ("stress", ("stress",)),
-    ("effort of the drives", ("effort",)),
-    ("mass", ("mass",)),
+# Labels; kind and settings of each: the paper's, and those that a comparison adds to them.
+_FILE = Path(__file__).with_name("objectives.toml")
+OBJECTIVES, RESPONSES = (
+    list(group.items()) for group in tomllib.loads(_FILE.read_text(encoding="utf-8")).values()
 )
 # Craig-Bampton with this many coordinates stands for the unreduced arm.
 REFERENCE_METHOD, REFERENCE = "craig-bampton", 48

@@ -193,7 +193,7 @@ def test_why_there_is_no_crisp_design(solid, contacts):
     assert one.count == contacts and not one.joins
     scene = do.load_scene(TWO_ARM, ("design.projection=heaviside",))
     run_ = SimpleNamespace(scene=scene, iterations=3, crisp=None)
-    told = _contact_warnings(run_, {0: SimpleNamespace(contacts=one, cell_size=0.005)})
+    told = [*_contact_warnings(run_, {0: SimpleNamespace(contacts=one, cell_size=0.005)})]
     assert len(told) == 1 + contacts
     assert ("contacts alone" in told[-1]) == bool(contacts)
     assert ("too weak" in told[-1]) == (not contacts)

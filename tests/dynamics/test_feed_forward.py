@@ -229,11 +229,11 @@ def test_what_the_summary_tells(tmp_path, plain) -> None:
 def test_short_leads_are_told(moved) -> None:
     """Where the corrections would begin before the lead does; a grey design has a remedy more."""
     begin = 3.0 / slowest_unstable_rate(moved.feed_forward)
-    assert begin < moved.scene.lead and not lead_warnings(moved, grey=True)
+    assert begin < moved.scene.lead and not [*lead_warnings(moved, grey=True)]
     short = small(TIP, f"feed_forward.lead={0.5 * begin}")
     (told,) = lead_warnings(short, grey=False)
     assert "feed_forward.lead" in told and f"{1e3 * begin:.2g} ms" in told
-    assert "design.projection" in lead_warnings(short, grey=True)[0]
+    assert "design.projection" in next(lead_warnings(short, grey=True))
 
 
 def test_internal_dynamics_mirror_without_damping() -> None:

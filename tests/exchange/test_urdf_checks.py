@@ -14,7 +14,6 @@ from dolfinopt.exchange.urdf.file import implausible_inertias, read_robot
 from dolfinopt.exchange.urdf.robot import scene_bodies
 from dolfinopt.scene.load import read_scene
 
-yourdfpy = pytest.importorskip("yourdfpy")
 trimesh = pytest.importorskip("trimesh")
 pytestmark = pytest.mark.serial
 
@@ -135,7 +134,7 @@ def joint(kind, parent, child, inside="", name="j"):
         (AB + joint("revolute", "a", "b", '<dynamics damping="-1"/>'), ["'j'", "damping", "-1"]),
         (AB + '<link name="c"/>' + joint("fixed", "b", "c") + joint("fixed", "c", "b", name="k"),
          ["loop"]),
-        ("<link/>", ["yourdfpy"]),
+        ("<link/>", ["a link without a name"]),
         (AB + joint("revolute", "a", "b", '<origin xyz="nan 0 0"/>'), ["'j'", "origin", "nan"]),
         ('<link name="a"><visual><geometry><box size="-1 1 1"/></geometry></visual></link>',
          ["'a'", "size of a box", "positive", "-1, 1, 1"]),
@@ -195,12 +194,12 @@ def test_files_that_are_no_robots(tmp_path, name, text, words):
 
 
 def test_without_the_extra_one_line_says_what_to_install(monkeypatch):
-    """The launcher installs it: whatever it sets up has an extra with yourdfpy."""
-    monkeypatch.setitem(sys.modules, "yourdfpy", None)
-    refusal(lambda: read_robot(DEMO), "yourdfpy", f"{sys.executable} -m pip install yourdfpy")
+    """The launcher installs it: whatever it sets up has an extra with trimesh."""
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    refusal(lambda: read_robot(DEMO), "packages", f"{sys.executable} -m pip install 'trimesh")
     projects = re.findall(r'ensure ready\S* "(.*)"', (ROOT / "dolfinopt.sh").read_text())
     extras = tree_of(ROOT / "pyproject.toml")["project"]["optional-dependencies"]
-    assert len(projects) == 4 and any("yourdfpy" in one for one in extras["robots"])
+    assert len(projects) == 4 and any("trimesh" in one for one in extras["robots"])
     assert any("[docs,outside,robots]" in one for one in extras["dev"])
     kinds = {one.removeprefix("${here}") for one in projects}
     assert kinds == {"[robots]", "[robots,docs]", "[dev]"}
@@ -214,7 +213,7 @@ def test_the_name_space_that_xacro_leaves_behind_is_no_xacro(tmp_path):
     file.write_text('<robot><link name="b"/></robot>')
     assert read_robot(file).name == "r"  # its file's, where it has none
     line = ["import", DEMO, DEMO_MOTION, "forearm"]
-    refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "folder")
+    refusal(lambda: run(*line, "--package-path", tmp_path / "none"), "--package-path", "none")
 
 
 @pytest.mark.parametrize("how", ["ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH", "above", "link"])

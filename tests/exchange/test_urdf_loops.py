@@ -108,4 +108,4 @@ def test_refused(tmp_path, table, words):
     table = table.replace("{kind}", "pin").replace("{link}", "rocker")
     robot, loops, motion = linkage(tmp_path, table)
     with refused("loops.toml", *words):
-        scene_of_robot(read_robot(robot), ("tool",), None, str(motion), loops, None, warn=print)
+        scene_of_robot(read_robot(robot), ("tool",), None, str(motion), loops, True, warn=print)

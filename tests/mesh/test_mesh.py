@@ -220,7 +220,7 @@ def test_cantilever(kind, share, tmp_path):
     scene = do.load_scene(ROOT / "demos" / "spatial_arm.toml", keys)
     members = Members(scene, kind, MESHED.get(kind, SOLID_BAR), tmp_path)
     made = members.case((share, share)).scene
-    _, arms, x_phys = arms_with_design(MPI.COMM_SELF, made, None, Profile())
+    _, _, arms, x_phys = arms_with_design(MPI.COMM_SELF, made, None, Profile())
     body = arms[1].reduce(x_phys[1])
     A, I_z, I_y, along_y, along_z, twist = moments(kind, share)
     assert body.mass == pytest.approx(2700.0 * A * LENGTH, rel=1e-9)

@@ -48,6 +48,6 @@ def test_warning(keys, told):
     mechanism = SimpleNamespace(bodies=[body], slices=[slice(0, 2)])
     scene = SimpleNamespace(arms=[arm], dimension=3)
     q = np.array([[0.0, 1e-3]]) @ np.linalg.inv(T).T  # torsion alone
-    found = torsion_warnings(SimpleNamespace(scene=scene, mechanism=mechanism, q_e=q))
+    found = [*torsion_warnings(SimpleNamespace(scene=scene, mechanism=mechanism, q_e=q))]
     assert len(found) == told
     assert all("100 %" in one and "9.6 %" in one and "quadratic" in one for one in found)

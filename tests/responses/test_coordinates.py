@@ -213,10 +213,10 @@ def test_summary_warns_of_too_few(monkeypatch, shared_tmp_path):
     known = SimpleNamespace(error=lambda count: 0.02)
     monkeypatch.setattr(assessment, "Comparison", lambda *_: known)
     scene = small(iterations=1)
-    written = write_result(shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
-    if written is not None:
-        assert written.summary["reduction"]["error_estimate"] == 0.02
-        (warning,) = (w for w in written.summary["warnings"] if "filter" not in w)
+    summary = write_result(shared_tmp_path, do.optimize(scene), 1.0, paraview=False)
+    if summary is not None:
+        assert summary["reduction"]["error_estimate"] == 0.02
+        (warning,) = (w for w in summary["warnings"] if "filter" not in w)
         assert "estimated error of 0.02, above 0.01" in warning
 
 

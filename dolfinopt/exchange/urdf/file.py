@@ -1,4 +1,4 @@
-"""A URDF file as a `Robot`: parsed by yourdfpy, checked for what a scene can hold; written back."""
+"""A URDF file as a `Robot`: read, checked for what a scene can hold; written back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +30,13 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
 SECTIONS = 64  # flat sides of a cylinder
-SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length")}  # of shapes
+# Of shapes: attributes, with as many numbers as each has.
+SIZES = {
+    "box": {"size": "0 0 0"},
+    "sphere": {"radius": "0"},
+    "cylinder": {"radius": "0", "length": "0"},
+}
+MOMENTS = "ixx", "ixy", "ixz", "iyy", "iyz", "izz"
 
 
 def read_robot(file: Path) -> Robot:
@@ -41,48 +46,42 @@ def read_robot(file: Path) -> Robot:
         file: URDF; packages are looked for as `mesh_path` says.
 
     Raises:
-        InputError: yourdfpy is not installed; no such file; not URDF; joints that a scene does not
-            have (floating, planar); links that are no tree.
+        InputError: trimesh or lxml are not installed; no such file; not URDF; joints that a scene
+            does not have (floating, planar); links that are no tree.
     """
     try:
-        from yourdfpy import URDF
+        import lxml  # noqa: F401
+        import trimesh  # noqa: F401
     except ImportError:
         raise InputError(
-            f"robots need the package yourdfpy: {sys.executable} -m pip install yourdfpy"
+            f"robots need packages for XML and surfaces: {sys.executable} -m pip install "
+            "'trimesh[easy]'"
         ) from None
-    tree = BytesIO(_parse(file))
+    root = _parse(file)
+    elements = {kind: root.findall(kind) for kind in ("link", "joint")}
+    for kind, items in elements.items():
+        _check_names(file, kind, [item.get("name", "") for item in items])
+    joints = [_joint(file, item) for item in elements["joint"]]
+    _check_mimics(file, joints)
     with _quiet():
-        try:
-            model = URDF.load(tree, build_scene_graph=False, load_meshes=False).robot
-        except (AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
-            raise InputError(
-                f"{file}: not a robot that yourdfpy can read ({type(error).__name__}: {error}); "
-                "check it with check_urdf"
-            ) from None
-        _check_names(file, "link", [link.name for link in model.links])
-        _check_names(file, "joint", [joint.name for joint in model.joints])
-        joints = [_joint(file, item) for item in model.joints]
-        _check_mimics(file, joints)
-        links = {item.name: _link(file, item) for item in model.links}
-    root, ordered = _ordered(file, list(links), joints)
-    return Robot(model.name, file, links, ordered, root)
+        links = {item.get("name"): _link(file, item) for item in elements["link"]}
+    first, ordered = _ordered(file, list(links), joints)
+    return Robot(root.get("name") or file.stem, file, links, ordered, first)
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what yourdfpy and trimesh log to themselves: errors are told in one line."""
-    loggers = [logging.getLogger(name) for name in ("yourdfpy", "yourdfpy.urdf", "trimesh")]
-    levels = [(logger, logger.level) for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL)
+    """Keep what trimesh logs to itself: errors are told in one line."""
+    logger = logging.getLogger("trimesh")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        for logger, level in levels:
-            logger.setLevel(level)
+        logger.setLevel(level)
 
 
-def safe_xml(file: Path, **options: Any) -> Any:
+def safe_xml(file: Path) -> Any:
     """Return the lxml tree of a file, which may not name other files or text that grows.
 
     Raises:
@@ -91,7 +90,7 @@ def safe_xml(file: Path, **options: Any) -> Any:
     """
     from lxml import etree
 
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, **options)
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False)
     tree = etree.parse(os.fspath(file), parser)
     declared = tree.docinfo.internalDTD
     if declared is not None and any(True for _ in declared.iterentities()):
@@ -99,12 +98,12 @@ def safe_xml(file: Path, **options: Any) -> Any:
     return tree
 
 
-def _parse(file: Path) -> bytes:
-    """Return the file's XML, which is that of a robot."""
+def _parse(file: Path) -> Any:
+    """Return the root of the file's XML, which is that of a robot."""
     from lxml import etree
 
     try:
-        root = safe_xml(file, remove_blank_text=True).getroot()
+        root = safe_xml(file).getroot()
     except OSError as error:
         reason = error.strerror or "no such file"
         raise InputError(f"{file}: cannot be read ({reason}); name a URDF file") from None
@@ -113,9 +112,7 @@ def _parse(file: Path) -> bytes:
     _check_expanded(file, root)
     if root.tag != "robot":
         raise InputError(f"{file}: expected an element <robot name=...>, found <{root.tag}>")
-    root.set("name", root.get("name") or file.stem)
-    text: bytes = etree.tostring(root)
-    return text
+    return root
 
 
 def _check_expanded(file: Path, root: Any) -> None:
@@ -134,6 +131,8 @@ def _check_expanded(file: Path, root: Any) -> None:
 def _check_names(file: Path, what: str, names: list[str]) -> None:
     if not names and what == "link":
         raise InputError(f"{file}: no links")
+    if "" in names:
+        raise InputError(f"{file}: a {what} without a name")
     for name, count in Counter(names).items():
         if count > 1:
             raise InputError(f"{file}: {what} {name!r} stands there {count} times")
@@ -142,58 +141,76 @@ def _check_names(file: Path, what: str, names: list[str]) -> None:
 # -- joints ----------------------------------------------------------------------------------
 
 
-def _joint(file: Path, joint: Any) -> RobotJoint:
-    where = f"{file}: joint {joint.name!r}"
-    if joint.type not in (*MOVABLE, "fixed"):
+@dataclass(frozen=True, eq=False)
+class _Element:
+    """An element of the file, and how messages about it begin."""
+
+    where: str
+    xml: Any
+
+    def stated(self, tag: str, name: str, default: str = "") -> str:
+        """Return an attribute of a child; the default where there is none."""
+        child = self.xml.find(tag)
+        return str(default if child is None else child.get(name, default))
+
+    def numbers(self, tag: str, name: str, default: str) -> np.ndarray:
+        """Return as many numbers of an attribute of a child as the default has."""
+        text, count = self.stated(tag, name, default), len(default.split())
+        try:
+            values = np.array(text.replace(",", " ").split(), dtype=float)
+        except ValueError:
+            values = np.full(count, math.nan)
+        if text != default and (len(values) != count or not np.isfinite(values).all()):
+            raise InputError(
+                f"{self.where}: {tag} {name} = {text!r}; expected finite numbers, {count}"
+            )
+        return values
+
+    def number(self, tag: str, name: str, default: str = "0", least: float = -math.inf) -> float:
+        """Return a number that may not be less than the least."""
+        value = float(self.numbers(tag, name, default)[0])
+        if value < least:
+            raise InputError(f"{self.where}: {tag} {name} = {value:g}; expected {least:g} or more")
+        return value
+
+    @property
+    def pose(self) -> np.ndarray:
+        """The pose that its origin states."""
+        from trimesh.transformations import euler_matrix
+
+        result = np.asarray(euler_matrix(*self.numbers("origin", "rpy", "0 0 0")))
+        result[:3, 3] = self.numbers("origin", "xyz", "0 0 0")
+        return result
+
+
+def _joint(file: Path, xml: Any) -> RobotJoint:
+    name, kind = xml.get("name"), xml.get("type")
+    joint = _Element(f"{file}: joint {name!r}", xml)
+    if kind not in (*MOVABLE, "fixed"):
         raise InputError(
-            f"{where}: type {joint.type!r}; a scene has joints of type {', '.join(MOVABLE)} and "
+            f"{joint.where}: type {kind!r}; a scene has joints of type {', '.join(MOVABLE)} and "
             "fixed"
         )
-    _check_finite(f"{where}: origin", _pose(joint.origin))
-    axis = np.asarray(joint.axis, dtype=float)
-    length = np.linalg.norm(axis) if axis.shape == (3,) else 0.0
-    if joint.type != "fixed" and not (math.isfinite(length) and length > 0.0):
-        raise InputError(f"{where}: axis {axis.tolist()}; expected three numbers, not all zero")
-    limit = joint.limit
-    lower, upper = -math.inf, math.inf
-    stated = [] if limit is None else [x for x in (limit.lower, limit.upper) if x is not None]
-    if stated and joint.type in ("revolute", "prismatic"):
-        lower, upper = limit.lower or 0.0, limit.upper or 0.0
-        _check_finite(f"{where}: limit", stated)
+    held = name, kind, joint.stated("parent", "link"), joint.stated("child", "link"), joint.pose
+    if kind == "fixed":
+        return RobotJoint(*held, np.array([1.0, 0.0, 0.0]))
+    axis, mimic, lower, upper = joint.numbers("axis", "xyz", "1 0 0"), None, -math.inf, math.inf
+    if not axis.any():
+        raise InputError(f"{joint.where}: axis {axis.tolist()}; expected three, not all zero")
+    if kind != "continuous" and (joint.stated("limit", "lower") or joint.stated("limit", "upper")):
+        lower, upper = joint.number("limit", "lower"), joint.number("limit", "upper")
         if lower > upper:
-            raise InputError(f"{where}: limit lower = {lower:g} above upper = {upper:g}")
-    rate, effort = (_limit(where, word, limit) for word in ("velocity", "effort"))
-    unit = axis / length if length else np.array([1.0, 0.0, 0.0])
-    mimic = None if joint.type == "fixed" or joint.mimic is None else _mimic(joint.mimic)
-    own = joint.name, joint.type, joint.parent, joint.child, _pose(joint.origin), unit
-    return RobotJoint(*own, lower, upper, rate, effort, mimic, _friction(where, joint))
-
-
-def _friction(where: str, joint: Any) -> tuple[float, float]:
-    """Return viscous and Coulomb friction of the element <dynamics>; 0 where nothing is stated."""
-    result = []
-    for word in ("damping", "friction"):
-        value = None if joint.dynamics is None else getattr(joint.dynamics, word)
-        value = 0.0 if value is None or joint.type == "fixed" else float(value)
-        if not (math.isfinite(value) and value >= 0.0):
-            raise InputError(f"{where}: dynamics {word} = {value:g}; expected a number >= 0")
-        result.append(value)
-    return result[0], result[1]
-
-
-def _limit(where: str, word: str, limit: Any) -> float:
-    """Return a limit of rate or effort; files that know none say 0, or nothing."""
-    value = None if limit is None else getattr(limit, word)
-    if not value:
-        return math.inf
-    if math.isnan(value) or value < 0.0:
-        raise InputError(f"{where}: limit {word} = {value:g}; expected a positive number")
-    return float(value)
-
-
-def _mimic(mimic: Any) -> Mimic:
-    multiplier = 1.0 if mimic.multiplier is None else float(mimic.multiplier)
-    return Mimic(mimic.joint, multiplier, 0.0 if mimic.offset is None else float(mimic.offset))
+            raise InputError(f"{joint.where}: limit lower = {lower:g} above upper = {upper:g}")
+    if xml.find("mimic") is not None:
+        factor = joint.number("mimic", "multiplier", "1")
+        mimic = Mimic(joint.stated("mimic", "joint"), factor, joint.number("mimic", "offset"))
+    # Files that know no limit of rate or effort say 0, or nothing.
+    rate = joint.number("limit", "velocity", "inf", 0.0) or math.inf
+    effort = joint.number("limit", "effort", "inf", 0.0) or math.inf
+    viscous = joint.number("dynamics", "damping", "0", 0.0)
+    friction = viscous, joint.number("dynamics", "friction", "0", 0.0)
+    unit = axis / np.linalg.norm(axis)
+    return RobotJoint(*held, unit, lower, upper, rate, effort, mimic, friction)
 
 
 def _check_mimics(file: Path, joints: list[RobotJoint]) -> None:
@@ -241,92 +258,86 @@ def _ordered(
 # -- links -----------------------------------------------------------------------------------
 
 
-def _pose(origin: Any) -> np.ndarray:
-    return np.eye(4) if origin is None else np.asarray(origin, dtype=float)
-
-
-def _link(file: Path, link: Any) -> RobotLink:
-    shapes, missing = _shapes(file, link.name, link.collisions or link.visuals)
+def _link(file: Path, xml: Any) -> RobotLink:
+    name = xml.get("name")
+    where, inertia = f"{file}: link {name!r}", None
+    if (inertial := xml.find("inertial")) is not None:
+        own = _Element(f"{where}: inertial", inertial)
+        tensor = np.empty((3, 3))
+        for key, a, b in zip(MOMENTS, *np.triu_indices(3)):
+            tensor[a, b] = tensor[b, a] = own.number("inertia", key)
+        mass = own.number("mass", "value")
+        inertia = Inertia(mass, np.zeros(3), tensor).posed(own.pose)
+    collisions, visuals = (
+        [_Element(f"{where}: {kind}", item) for item in xml.findall(kind)]
+        for kind in ("collision", "visual")
+    )
+    shapes, missing = _shapes(file, collisions or visuals)
 
     def visual() -> tuple[Trimesh, ...]:
         with _quiet():
-            return _shapes(file, link.name, link.visuals)[0]
+            return _shapes(file, visuals)[0]
 
-    both = link.collisions and link.visuals
-    return RobotLink(link.name, _inertia(file, link), shapes, missing, visual if both else None)
+    return RobotLink(name, inertia, shapes, missing, visual if collisions and visuals else None)
 
 
 def _shapes(
-    file: Path, link: str, elements: Sequence[Any]
+    file: Path, elements: Sequence[_Element]
 ) -> tuple[tuple[Trimesh, ...], tuple[str, ...]]:
     """Return the surfaces of a link's elements in its frame, and meshes that cannot be read."""
     shapes, missing = [], []
     for element in elements:
         try:
-            shape = _shape(file, link, element.geometry)
+            shape = _shape(file, element)
         except FileNotFoundError as error:
             missing.append(str(error))
             continue
-        pose = _pose(element.origin)
-        _check_finite(f"{file}: link {link!r}: origin of a shape", pose)
-        shape.apply_transform(pose)
+        shape.apply_transform(element.pose)
         shapes.append(shape)
     return tuple(shapes), tuple(missing)
 
 
-def _inertia(file: Path, link: Any) -> Inertia | None:
-    inertial = link.inertial
-    if inertial is None:
-        return None
-    pose = _pose(inertial.origin)
-    tensor = np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia
-    mass = 0.0 if inertial.mass is None else float(inertial.mass)
-    if not (np.isfinite(tensor).all() and math.isfinite(mass) and np.isfinite(pose).all()):
-        raise InputError(f"{file}: link {link.name!r}: inertial holds a number that is not finite")
-    R = pose[:3, :3]
-    return Inertia(mass, pose[:3, 3], R @ tensor @ R.T)
-
-
-def _check_finite(where: str, numbers: Any, positive: bool = False) -> None:
-    values = np.atleast_1d(np.asarray(numbers, dtype=float))
-    if not np.isfinite(values).all() or (positive and (values <= 0.0).any()):
-        kind, given = "positive" if positive else "finite", ", ".join(f"{x:g}" for x in values.flat)
-        raise InputError(f"{where}: expected {kind} numbers, found {given}")
-
-
-def _shape(file: Path, link: str, geometry: Any) -> Trimesh:
-    """Return the surface of a geometry element of a link."""
+def _shape(file: Path, element: _Element) -> Trimesh:
+    """Return the surface of a shape of a link."""
     from trimesh import creation
 
-    for kind, names in SIZES.items():
-        if (shape := getattr(geometry, kind)) is not None:
-            size = np.hstack([getattr(shape, name) for name in names])
-            _check_finite(f"{file}: link {link!r}: size of a {kind}", size, positive=True)
-    if (shape := geometry.box) is not None:
-        return creation.box(extents=shape.size)
-    if (shape := geometry.sphere) is not None:
-        return creation.icosphere(subdivisions=4, radius=shape.radius)
-    if (shape := geometry.cylinder) is not None:
-        return creation.cylinder(radius=shape.radius, height=shape.length, sections=SECTIONS)
-    return _mesh(file, geometry.mesh)
+    shape = element.xml.find("geometry/*")
+    kind = None if shape is None else shape.tag
+    if kind == "mesh":
+        return _mesh(file, element)
+    if kind not in SIZES:
+        raise InputError(f"{element.where}: geometry: expected {', '.join(SIZES)} or mesh")
+    names = SIZES[kind].items()
+    sizes = np.concatenate([element.numbers(f"geometry/{kind}", *item) for item in names])
+    if not (sizes > 0.0).all():
+        given = ", ".join(f"{x:g}" for x in sizes)
+        raise InputError(
+            f"{element.where}: size of a {kind}: expected positive numbers, found {given}"
+        )
+    if kind == "box":
+        return creation.box(extents=sizes)
+    if kind == "sphere":
+        return creation.icosphere(subdivisions=4, radius=sizes[0])
+    return creation.cylinder(radius=sizes[0], height=sizes[1], sections=SECTIONS)
 
 
-def _mesh(file: Path, mesh: Any) -> Trimesh:
+def _mesh(file: Path, element: _Element) -> Trimesh:
     import trimesh
 
-    if not mesh.filename:
+    name, tag = element.stated("geometry/mesh", "filename"), "geometry/mesh"
+    if not name:
         raise FileNotFoundError("a mesh without a name")
-    path = mesh_path(file, mesh.filename)
+    path = mesh_path(file, name)
     if path is None:
-        raise FileNotFoundError(f"mesh {mesh.filename} not found{_similar(file, mesh.filename)}")
+        raise FileNotFoundError(f"mesh {name} not found{_similar(file, name)}")
     try:
         result: Any = trimesh.load_mesh(os.fspath(path))
     except Exception as error:  # every format has its own
-        raise FileNotFoundError(f"mesh {mesh.filename} cannot be read") from error
+        raise FileNotFoundError(f"mesh {name} cannot be read") from error
     if not isinstance(result, trimesh.Trimesh) or not len(result.faces):
-        raise FileNotFoundError(f"mesh {mesh.filename} holds no triangles")
-    if mesh.scale is not None:
-        result.apply_scale(mesh.scale)
+        raise FileNotFoundError(f"mesh {name} holds no triangles")
+    count = len(element.stated(tag, "scale", "1").split())  # one number, or one for each axis
+    result.apply_scale(element.numbers(tag, "scale", "1 1 1" if count > 1 else "1"))
     return result
 
 
@@ -533,7 +544,6 @@ def _inertial(inertia: Inertia) -> Any:
     element = etree.Element("inertial")
     etree.SubElement(element, "origin", xyz=" ".join(map(number, inertia.centre)), rpy="0 0 0")
     etree.SubElement(element, "mass", value=number(inertia.mass))
-    pairs = ("xx", "xy", "xz", "yy", "yz", "zz")
-    moments = inertia.tensor[np.triu_indices(3)]
-    etree.SubElement(element, "inertia", **{f"i{k}": number(x) for k, x in zip(pairs, moments)})
+    moments = map(number, inertia.tensor[np.triu_indices(3)])
+    etree.SubElement(element, "inertia", **dict(zip(MOMENTS, moments)))
     return element

@@ -2,10 +2,11 @@
 
 Meshes of robots are made for pictures and collisions: open, in many pieces, inside out. What they
 enclose is therefore found on a grid. A piece that is closed fills what lies within it; holes of an
-open one are closed by VTK (pyvista's `fill_holes`), and where that does not close it, by filling
-the grid within its surface after a morphological closing (Serra, Image Analysis and Mathematical
-Morphology, 1982). Their union is cut at the joints; of its pieces the largest stays. Cubes that
-are at least half full are the cells, and their outer corners are moved onto the surface.
+open one are closed by VTK (pyvista's `fill_holes`). What that leaves open is filled on a grid
+within its surface after a morphological closing (Serra, Image Analysis and Mathematical Morphology,
+1982), whose contour is a closed piece. Their union is cut at the joints; of its pieces the largest
+stays. Cubes that are at least half full are the cells, and their outer corners are moved onto the
+surface.
 """
 
 from __future__ import annotations
@@ -13,8 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
@@ -111,26 +111,23 @@ class _Grid:
     step: float
     shape: tuple[int, int, int]
 
-    def taken_from(self, other: _Grid, mask: np.ndarray) -> np.ndarray:
-        """Return what is True at the middles of these voxels on another grid, False beyond it."""
-        around, at = np.pad(mask, 1), []
-        for k, count in enumerate(self.shape):
-            middle = self.low[k] + (np.arange(count) + 0.5) * self.step
-            index = np.floor((middle - other.low[k]) / other.step).astype(int)
-            at.append(1 + np.clip(index, -1, other.shape[k]))
-        return np.asarray(around[np.ix_(*at)])
+    @property
+    def image(self) -> Any:
+        """PyVista's image whose points are the middles."""
+        import pyvista
+
+        return pyvista.ImageData(
+            dimensions=self.shape,
+            spacing=(self.step,) * 3,
+            origin=[float(x) + 0.5 * self.step for x in self.low],
+        )
 
     def filled_by(self, closed: Trimesh) -> np.ndarray:
         """Return True for the voxels whose middle lies within a closed surface."""
         import pyvista
 
-        image = pyvista.ImageData(
-            dimensions=self.shape,
-            spacing=(self.step,) * 3,
-            origin=[float(x) + 0.5 * self.step for x in self.low],
-        )
         surface = pyvista.wrap(closed)
-        result = surface.voxelize_binary_mask(reference_volume=image)["mask"]
+        result = surface.voxelize_binary_mask(reference_volume=self.image)["mask"]
         return np.asarray(result).reshape(self.shape, order="F") > 0
 
     def passed_by(self, surface: Trimesh) -> np.ndarray:
@@ -148,82 +145,93 @@ class _Grid:
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    """The pieces of a link's surface in the arm's frame, and what was done to close them."""
+    """The closed pieces of a link's surface in the arm's frame, and what was done to close them."""
 
     closed: tuple[Trimesh, ...]
     hollows: tuple[Trimesh, ...]
-    open: tuple[Trimesh, ...]
     done: tuple[str, ...]
 
     @property
     def bounds(self) -> np.ndarray:
         """Lowest and highest corner (2, 3) of the box around them, m."""
-        every = np.array([piece.bounds for piece in (*self.closed, *self.open)])
-        return np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
+        return _bounds(self.closed)
 
     @property
     def wall(self) -> float:
         """Mean thickness of what is between surfaces, 2 V / A, m: of a hollow link, of its wall."""
-        if not self.closed:
-            return np.inf
-        volume = sum(piece.volume for piece in self.closed) - sum(
-            piece.volume for piece in self.hollows
-        )
+        volume = sum(piece.volume for piece in self.closed)
+        volume -= sum(piece.volume for piece in self.hollows)
         return float(2.0 * volume / sum(piece.area for piece in (*self.closed, *self.hollows)))
 
     def on(self, grid: _Grid) -> np.ndarray:
         """Return True for the voxels within the geometry."""
-        result = np.zeros(grid.shape, dtype=bool)
-        for piece in self.closed:
-            result |= grid.filled_by(piece)
+        result = _filled(grid, self.closed)
         for piece in self.hollows:
             result &= ~grid.filled_by(piece)
-        if self.open:
-            result |= grid.taken_from(*self._within_open)
         return result
 
-    @cached_property
-    def _within_open(self) -> tuple[_Grid, np.ndarray]:
-        """A grid about all pieces, and True for its voxels within open ones, or within closed."""
-        low, high = self.bounds
-        size = float((high - low).max())
-        radius = round(GAP * SHELL)
-        margin = (radius + 1) * size / SHELL
-        grid = _grid(low - margin, high + margin, size / SHELL)
-        shell = np.zeros(grid.shape, dtype=bool)
-        for piece in self.closed:
-            shell |= grid.filled_by(piece)
-        for piece in self.open:
-            shell |= grid.passed_by(piece)
-        shell = ndimage.binary_dilation(shell, iterations=radius)
-        shell = ndimage.binary_fill_holes(shell)
-        shell = ndimage.binary_erosion(shell, iterations=radius)
-        # A sheet that encloses nothing has no volume.
-        return grid, ndimage.binary_opening(shell, iterations=1)
-
-    def distance(self, points: np.ndarray, near: float) -> np.ndarray:
-        """Return the signed distance (n,) from closed pieces, positive outside, m; far: `near`."""
-        result = np.full(len(points), near)
+    def nearest(self, points: np.ndarray, near: float) -> np.ndarray:
+        """Return the nearest points (n, 3) of the surface; themselves where that is not near, m."""
+        distance, result = np.full(len(points), near), points.copy()
         for pieces, sign in ((self.closed, 1.0), (self.hollows, -1.0)):
             for piece in pieces:
                 low, high = piece.bounds
-                at = ((points > low - near) & (points < high + near)).all(axis=1)
-                own = sign * _distance(piece, points[at])
-                result[at] = (
-                    np.minimum(result[at], own) if sign > 0 else np.maximum(result[at], own)
-                )
+                at = np.flatnonzero(((points > low - near) & (points < high + near)).all(axis=1))
+                own, places = _distance(piece, points[at])
+                nearer = sign * (sign * own - distance[at]) < 0.0
+                at = at[nearer]
+                distance[at], result[at] = sign * own[nearer], places[nearer]
         return result
 
 
-def _distance(closed: Trimesh, points: np.ndarray) -> np.ndarray:
-    """Return the signed distance (n,) of points from a closed surface, negative inside, m."""
+def _bounds(pieces: Sequence[Trimesh]) -> np.ndarray:
+    every = np.array([piece.bounds for piece in pieces])
+    return np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
+
+
+def _filled(grid: _Grid, closed: Sequence[Trimesh]) -> np.ndarray:
+    """Return True for the voxels within closed pieces."""
+    result = np.zeros(grid.shape, dtype=bool)
+    for piece in closed:
+        result |= grid.filled_by(piece)
+    return result
+
+
+def _distance(closed: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return signed distances (n,) from a closed surface, negative inside, and nearest points."""
     import pyvista
 
     if not len(points):
-        return np.zeros(0)
-    surface = pyvista.wrap(closed)
+        return np.zeros(0), np.zeros((0, 3))
+    surface: Any = pyvista.wrap(closed)
     result = pyvista.PolyData(points).compute_implicit_distance(surface)
-    return np.asarray(result["implicit_distance"])
+    _, nearest = surface.find_closest_cell(points, return_closest_point=True)
+    return np.asarray(result["implicit_distance"]), np.asarray(nearest)
+
+
+def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]:
+    """Return the closed surface of what open pieces enclose, together with closed ones; or none."""
+    import trimesh
+
+    low, high = _bounds([*left, *closed])
+    step, radius = float((high - low).max()) / SHELL, round(GAP * SHELL)
+    margin = (radius + 1) * step
+    grid = _grid(low - margin, high + margin, step)
+    shell = _filled(grid, closed)
+    for piece in left:
+        shell |= grid.passed_by(piece)
+    shell = ndimage.binary_dilation(shell, iterations=radius)
+    shell = ndimage.binary_fill_holes(shell)
+    shell = ndimage.binary_erosion(shell, iterations=radius)
+    shell = ndimage.binary_opening(shell, iterations=1)  # a sheet encloses nothing
+    if not shell.any():
+        return []
+    image = grid.image
+    image["inside"] = ndimage.gaussian_filter(shell.astype(float), 1.0).ravel(order="F")
+    surface = image.contour([0.5], "inside")
+    result = trimesh.Trimesh(surface.points, surface.regular_faces)
+    _turn_outwards(result)
+    return [result]
 
 
 def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCells:
@@ -322,7 +330,10 @@ def _pieces(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> _Pieces:
         (many - 1, f"{_pieces_of(many)} united"),
         (dropped, f"{_pieces_of(dropped)} below {100 * TINY:g} % of its size left out"),
     ]
-    return _Pieces(tuple(closed), tuple(hollows), tuple(left), tuple(w for n, w in said if n))
+    closed += _within(left, closed) if left else []
+    if not closed:
+        raise NoSolid("its geometry encloses nothing")
+    return _Pieces(tuple(closed), tuple(hollows), tuple(w for n, w in said if n))
 
 
 def _pieces_of(count: int) -> str:
@@ -399,8 +410,6 @@ def _region(
         x = grid.low[0] + (np.arange(grid.shape[0]) + 0.5) * grid.step
         result[(x < ends[0]) | (x > ends[1])] = False
     if not result.any():
-        if ends is None:
-            raise NoSolid("its geometry encloses nothing")
         return result, 0.0
     largest = _connected(result)
     return largest, float(largest.sum() / result.sum())
@@ -531,7 +540,7 @@ def _cells(
     else:
         patches = _nearest(points, facets, length)
     held = [np.unique(patch) for patch in patches]
-    points = _on_surface(pieces, points, cells, facets, region, fine, held, ends is not None)
+    points = _on_surface(pieces, points, cells, facets, side, held if ends is not None else [])
     return LinkCells(points, cells, patches[0], patches[1], side, tuple(notes))
 
 
@@ -555,44 +564,25 @@ def _on_surface(
     points: np.ndarray,
     cells: np.ndarray,
     facets: np.ndarray,
-    region: np.ndarray,
-    grid: _Grid,
-    held: Sequence[np.ndarray],
-    flat: bool,
+    side: float,
+    flat: Sequence[np.ndarray],
 ) -> np.ndarray:
-    """Move the outer points onto the surface, as far as the cells stay good."""
-    # The way comes from the voxels, and how far from the surfaces of closed pieces; where there are
-    # open ones from the voxels, too. Points of flat ends stay in their plane.
-    pad = 2
-    # Beyond a flat end the geometry goes on: there its surface is no surface.
-    inside = np.pad(region, ((pad, pad),) * 3, mode="edge" if flat else "constant")
-    for axis in (1, 2):
-        for edge in (slice(0, pad), slice(-pad, None)):
-            inside[tuple(edge if k == axis else slice(None) for k in range(3))] = False
-    away = ndimage.distance_transform_edt(~inside) - ndimage.distance_transform_edt(inside)
-    away = ndimage.gaussian_filter(away - 0.5 * np.sign(away), 1.0) * grid.step
-    slopes = np.gradient(away, grid.step)
+    """Move the outer points onto the surface, as far as the cells stay good.
+
+    Those of `flat` ends stay in their plane: there the surface goes on.
+    """
     outer = np.unique(facets)
-    moved = points[outer].copy()
-    free = np.ones_like(moved)
-    if flat:
-        free[np.isin(outer, np.concatenate(held)), 0] = 0.0
+    moved, held = points[outer].copy(), np.isin(outer, np.concatenate([[-1], *flat]))
     for _ in range(4):
-        at = ((moved - grid.low) / grid.step - 0.5 + pad).T
-        slope = np.stack([ndimage.map_coordinates(g, at, order=1, mode="nearest") for g in slopes])
-        way = slope.T * free
-        if pieces.open:
-            value = ndimage.map_coordinates(away, at, order=1, mode="nearest")
-        else:
-            value = pieces.distance(moved, FINE * grid.step)
-        moved -= (value / np.maximum((way * slope.T).sum(axis=1), 0.25))[:, None] * way
+        nearest = pieces.nearest(moved, side)
+        nearest[held, 0] = moved[held, 0]
+        moved = nearest
     shift = np.zeros_like(points)
     shift[outer] = moved - points[outer]
     longest = np.linalg.norm(shift, axis=1, keepdims=True)
-    cell = FINE * grid.step
-    shift *= np.minimum(1.0, LONGEST * cell / np.maximum(longest, 1e-30))
+    shift *= np.minimum(1.0, LONGEST * side / np.maximum(longest, 1e-30))
     tries = 0
-    while (bad := _jacobians((points + shift)[cells]).min(axis=1) < LEAST * cell**3).any():
+    while (bad := _jacobians((points + shift)[cells]).min(axis=1) < LEAST * side**3).any():
         shift[np.unique(cells[bad])] *= EASED if tries < 20 else 0.0
         tries += 1
     return np.asarray(points + shift)

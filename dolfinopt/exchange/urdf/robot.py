@@ -35,6 +35,8 @@ from dolfinopt.scene.toml import read_toml
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
+    from dolfinopt.exchange.urdf.geometry import LinkCells
+
 Point = tuple[float, float, float]
 MOVABLE = ("revolute", "continuous", "prismatic")
 
@@ -344,19 +346,6 @@ GROUND = "ground"
 
 
 @dataclass(frozen=True, eq=False)
-class SolidMesh:
-    """A solid in the shape of its link."""
-
-    data: bytes  # .msh file of its hexahedra
-    cells: int  # their number
-    size: float  # of a cell, m
-    volume: float  # m3
-    ends: float  # volume of the cells within `size` of the interfaces, m3
-    offset: float  # largest distance of an interface's middle from its joint, m
-    done: tuple[str, ...]  # with the link's geometry, in a few words each
-
-
-@dataclass(frozen=True, eq=False)
 class SceneBody:
     """One of a scene's arms.
 
@@ -386,7 +375,7 @@ class SceneBody:
     length: float = 0.0
     size: tuple[float, float] | None = None
     measured: bool = False
-    mesh: SolidMesh | None = None
+    mesh: LinkCells | None = None
 
     @property
     def is_solid(self) -> bool:

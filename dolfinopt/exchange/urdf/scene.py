@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from dolfinopt.exchange.urdf.robot import (
     RobotJoint,
     RobotLoops,
     SceneBody,
-    SolidMesh,
     default_tool,
     places_of,
     read_loops,
@@ -36,9 +35,6 @@ from dolfinopt.exchange.urdf.robot import (
 from dolfinopt.motion.paths import curve_in_time
 from dolfinopt.scene.csv_table import Table, column_names, read_table
 from dolfinopt.scene.toml import toml_value
-
-if TYPE_CHECKING:
-    from dolfinopt.exchange.urdf.geometry import LinkCells
 
 TRAJECTORY = "trajectory.csv"  # beside the scene
 RECORD = "robot.json"  # beside the scene: where its solids come from
@@ -163,15 +159,17 @@ class RobotScene:
         """Return the name of a solid's mesh file."""
         return f"{self.arms[body.link]}.msh"
 
-    def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[Path, str | bytes]:
-        """Return all files of a folder, the scene last: where it is, the others are.
+    def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[str, str | bytes]:
+        """Return all files of a folder by their names, the scene last: where it is, all are.
 
         Args:
             folder: of the scene.
             t, rows: (n,) s, (n, joints) of all joints that move, then of driven rods.
         """
-        new: dict[Path, str | bytes] = {
-            folder / self.mesh_name(item): item.mesh.data for item in self.bodies if item.mesh
+        from dolfinopt.mesh.solid_cells import msh_bytes  # loads Gmsh
+
+        new: dict[str, str | bytes] = {
+            self.mesh_name(item): msh_bytes(item.mesh) for item in self.bodies if item.mesh
         }
         columns = [*(joint.name for joint in self.robot.movable), *self.loops.rods]
         kept = [k for k, name in enumerate(columns) if name not in self.loops.passive]
@@ -179,7 +177,7 @@ class RobotScene:
         lines = [",".join(["t", *names])]
         table = np.column_stack([t, rows[:, kept]])
         lines += [",".join(map(repr, map(float, row))) for row in table]
-        new[folder / TRAJECTORY] = "\n".join(lines) + "\n"
+        new[TRAJECTORY] = "\n".join(lines) + "\n"
         # What `export RUN robot` needs: the file, and every solid's link and frame.
         urdf = Path(os.path.relpath(self.robot.file.absolute(), folder.absolute())).as_posix()
         solids = {
@@ -187,8 +185,8 @@ class RobotScene:
             for body in self.bodies
             if body.is_solid
         }
-        new[folder / RECORD] = json.dumps({"urdf": urdf, "solids": solids}, indent=2) + "\n"
-        return new | {folder / f"{self.robot.file.stem}.toml": self.text()}
+        new[RECORD] = json.dumps({"urdf": urdf, "solids": solids}, indent=2) + "\n"
+        return new | {f"{self.robot.file.stem}.toml": self.text()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,8 +252,9 @@ class _Extent:
 def _extent(body: SceneBody) -> _Extent:
     assert body.size is not None
     if body.mesh is not None:
-        mesh, passive = body.mesh, min(body.mesh.size, PASSIVE * body.length)
-        return _Extent(body.size, mesh.size, float(f"{passive:.6g}"), mesh.volume, mesh.ends)
+        mesh, passive = body.mesh, min(body.mesh.side, PASSIVE * body.length)
+        ends = mesh.ends_within(mesh.side)
+        return _Extent(body.size, mesh.side, float(f"{passive:.6g}"), mesh.volume, ends)
     height, thickness = (_up(item) for item in body.size)
     cells = cells_of(body.length, height, thickness)
     along, *across = (x / n for x, n in zip((body.length, height, thickness), cells, strict=True))
@@ -395,7 +394,6 @@ def _unit(joint: RobotJoint) -> str:
 
 # -- from a robot to a scene -----------------------------------------------------------------
 
-MeshWriter = Callable[["LinkCells"], bytes]  # the bytes of a mesh file
 Warn = Callable[[list[str]], None]
 
 
@@ -405,7 +403,7 @@ def scene_of_robot(
     tool: str | None,
     trajectory: str,
     closures: Path | None,
-    write_mesh: MeshWriter | None,
+    boxes: bool,
     warn: Warn,
 ) -> tuple[RobotScene, np.ndarray, np.ndarray]:
     """Return the scene of a robot, instants (n,) and rows (n, joints and rods) of its table.
@@ -416,7 +414,7 @@ def scene_of_robot(
         tool: end-effector's link; None: the end of the solids' chain.
         trajectory: table of joint coordinates.
         closures: table of closed loops, if there is one.
-        write_mesh: makes mesh files of solids in their links' shapes; None: all are boxes.
+        boxes: whether solids are boxes, whatever their links' shapes.
         warn: takes what is doubtful, as it is found.
 
     Raises:
@@ -428,43 +426,31 @@ def scene_of_robot(
         loops = read_loops(robot, bodies, places, closures)
     t, rows, said = read_trajectory(robot, trajectory, loops)
     warn([*said, *implausible_inertias(robot)])
-    if write_mesh is not None:
-        bodies = tuple(
-            _meshed(robot, body, write_mesh, warn) if body.is_solid else body for body in bodies
-        )
+    if not boxes:
+        bodies = tuple(_meshed(robot, body, warn) if body.is_solid else body for body in bodies)
     start_joints = tuple(map(float, rows[0, : len(robot.movable)]))
     return RobotScene(robot, bodies, float(t[-1]), loops, start_joints), t, rows
 
 
-def _meshed(robot: Robot, body: SceneBody, write_mesh: MeshWriter, warn: Warn) -> SceneBody:
+def _meshed(robot: Robot, body: SceneBody, warn: Warn) -> SceneBody:
     """Return a solid in the shape of its link; a box, and a sentence, where it cannot be."""
     # The shape is that of the collision elements; of the visual ones where those are no solid.
     from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints  # loads trimesh
 
     link = robot.links[body.link]
-    done: tuple[str, ...] = ()
     try:
         try:
-            result = cells_between_joints(link.shapes, body)
+            mesh = cells_between_joints(link.shapes, body)
         except NoSolid as error:
             if link.visual is None:
                 raise
             try:
-                result = cells_between_joints(link.visual(), body)
+                mesh = cells_between_joints(link.visual(), body)
             except NoSolid:
                 raise error from None
-            done = ("visual geometry",)
+            mesh = replace(mesh, done=("visual geometry", *mesh.done))
     except NoSolid as error:
         warn([f"{robot.file}: link {body.link!r} becomes a box: {error}"])
         return body
-    _, height, thickness = map(float, result.extents)
-    mesh = SolidMesh(
-        write_mesh(result),
-        len(result.cells),
-        result.side,
-        result.volume,
-        result.ends_within(result.side),
-        result.offset(body.length),
-        (*done, *result.done),
-    )
+    _, height, thickness = map(float, mesh.extents)
     return replace(body, size=(height, thickness), mesh=mesh)
