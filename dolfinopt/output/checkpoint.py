@@ -6,7 +6,8 @@ import copyreg
 import hashlib
 import json
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -58,6 +59,17 @@ def begin(folder: Path, scene: Scene) -> None:
     """Write the checkpoint of a run that has done nothing yet, and nothing else (root only)."""
     remove_stale(folder)
     _sealed(folder, _stamp(scene))
+
+
+@contextmanager
+def withdrawn(folder: Path | None) -> Iterator[None]:
+    """Leave no checkpoint in a folder where bad input ends the block; None: let it be."""
+    try:
+        yield
+    except InputError:
+        if folder is not None:
+            (folder / NAME).unlink(missing_ok=True)
+        raise
 
 
 def _stamp(scene: Scene) -> dict[str, np.ndarray]:

@@ -75,6 +75,8 @@ def working_alone(
 ) -> Iterator[None]:
     """Keep other runs out of a folder until the block ends; create it first (collective).
 
+    A folder in which nothing is then goes.
+
     Args:
         world: all ranks.
         folder: of the run.
@@ -85,10 +87,15 @@ def working_alone(
     """
     from dolfinopt.parallel import on_root
 
+    def leave() -> None:
+        with suppress(OSError):
+            folder.rmdir()
+
     with ExitStack() as held:
 
         def enter() -> None:
             prepare_folder(folder)
+            held.callback(leave)
             held.enter_context(working_in(folder))
             if check is not None:
                 check()

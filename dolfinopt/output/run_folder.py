@@ -184,10 +184,10 @@ def optimize(
     if resume and overwrite:
         raise InputError("resume, overwrite: expected only one of them")
     scene.check_designed()
+    anew = not (resume or overwrite)
     with ExitStack() as stack:
         if folder is not None:
             on_root(world, check_sources, folder, RUN_FILES, scene)
-            anew = not (resume or overwrite)
             check = partial(check_unused, folder, resume=checkpoint.NAME) if anew else None
             stack.enter_context(working_alone(world, folder, check))
             if anew:
@@ -198,7 +198,8 @@ def optimize(
         profile = Profile()
         if built is None:
             partition = partition_arms(world, scene.cell_counts, undivided=scene.dimension == 2)
-            built = partition, build_arms(scene, partition, profile)
+            with checkpoint.withdrawn(folder if anew else None):
+                built = partition, build_arms(scene, partition, profile)
         memory, recorder = None, None
         if folder is not None:
             if overwrite:  # not before: a mesh that fails leaves the old results

@@ -226,15 +226,18 @@ def test_results_are_replaced_only_when_asked(shared_tmp_path, name):
 
 @pytest.mark.serial
 def test_a_run_that_cannot_begin_leaves_the_old_results(shared_tmp_path):
-    """--overwrite removes nothing before the arms are built."""
+    """--overwrite removes nothing before the arms are built; a new folder is not left."""
     folder, mesh = shared_tmp_path / "o", shared_tmp_path / "bad.geo"
     line = ["optimize", TWO_ARM, "--set", "optimizer.max_iterations=1", "--no-plots"]
     run(*line, *TINY, "--out", folder)
     before = contents(folder)
     mesh.write_text("x = = 1;\n")
-    more = ["--set", f"arms.mesh={mesh}", "--out", folder, "--overwrite"]
-    refusal(lambda: run(*line, *more), "bad.geo")
+    line += ["--set", f"arms.mesh={mesh}", "--out"]
+    refusal(lambda: run(*line, folder, "--overwrite"), "bad.geo")
     assert contents(folder) == before
+    new = shared_tmp_path / "new"
+    refusal(lambda: run(*line, new), "bad.geo")
+    assert not new.exists()
 
 
 HOLDER = """
