@@ -75,7 +75,7 @@ def working_alone(
 ) -> Iterator[None]:
     """Keep other runs out of a folder until the block ends; create it first (collective).
 
-    A folder in which nothing is then goes.
+    A new folder in which nothing is then goes.
 
     Args:
         world: all ranks.
@@ -94,8 +94,9 @@ def working_alone(
     with ExitStack() as held:
 
         def enter() -> None:
+            if not folder.exists():
+                held.callback(leave)
             prepare_folder(folder)
-            held.callback(leave)
             held.enter_context(working_in(folder))
             if check is not None:
                 check()
