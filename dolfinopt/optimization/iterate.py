@@ -19,7 +19,7 @@ from dolfinopt.optimization.measured import (
     SHORTER_REACH,
     STEP_ATTEMPTS,
 )
-from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
+from dolfinopt.optimization.mma import MMAState, initial_state, mma_step, on_grid
 from dolfinopt.optimization.problem import EvaluatedDesign, Problem, limits_at, problem_of
 from dolfinopt.optimization.residual import Residual, kkt_residual
 from dolfinopt.optimization.state import Best, HistoryRow, Memory, Progress
@@ -191,8 +191,8 @@ class Iterate:
         if self.curved:
             step = partial(step, widest=CURVED_ASYMPTOTE_DISTANCE)
         with self.evaluator.profile.phase("mma"):
-            result: tuple[np.ndarray, MMAState] = on_root(self.world, step, *self._posed)
-        return result
+            new, after = on_root(self.world, step, *self._posed)
+        return on_grid(new, self.variables.xmin, self.variables.xmax), after
 
     @property
     def _posed(self) -> tuple[np.ndarray, ...]:

@@ -28,7 +28,7 @@ from dolfinopt.optimization.measured import (
     DEPENDENT_SHARE,
     DUAL_EVALUATIONS,
     FIRST_ASYMPTOTE_DISTANCE,
-    REST_MOVE_SHARE,
+    GRID,
     ROUNDING,
 )
 
@@ -148,6 +148,21 @@ def mma_step(
     return new, after
 
 
+def on_grid(x: Array, xmin: npt.ArrayLike, xmax: npt.ArrayLike) -> Array:
+    """Return the nearest design (n,) whose variables are multiples of `GRID` of their ranges.
+
+    What rounding has made of a step, other with every processor, is then forgotten: it does not
+    grow from step to step.
+
+    Args:
+        x: (n,) design.
+        xmin, xmax: (n,) or scalar bounds.
+    """
+    low, width = np.asarray(xmin, np.float64), np.subtract(xmax, xmin)
+    steps = np.divide(x - low, GRID * width, out=np.zeros_like(x), where=width > 0.0)
+    return np.asarray(np.clip(low + GRID * width * np.round(steps), xmin, xmax))
+
+
 def _check(x: Array, low: Array, high: Array, f: Array, gradients: Array) -> None:
     """Raise ValueError where an input is not finite, or x outside its bounds."""
     for name, values in {"x": x, "f": f, "gradients times ranges": gradients}.items():
@@ -163,9 +178,8 @@ def _asymptote_distances(x: Array, width: Array, state: MMAState, widest: float)
     """Return the distances of the asymptotes from x in units of the ranges `width`."""
     if state.iteration < 2:
         return np.full(width.shape, FIRST_ASYMPTOTE_DISTANCE)
-    last, before = (x - state.x_old1) / width, (state.x_old1 - state.x_old2) / width
-    moving = np.minimum(np.abs(last), np.abs(before)) > REST_MOVE_SHARE
-    factor = np.where(moving, np.where((last > 0.0) == (before > 0.0), _WIDEN, _NARROW), 1.0)
+    turned = (x - state.x_old1) * (state.x_old1 - state.x_old2)
+    factor = np.where(turned > 0.0, _WIDEN, np.where(turned < 0.0, _NARROW, 1.0))
     distance = factor * (state.upp - state.low) / (2.0 * width)
     return np.clip(distance, _NEAREST, widest)
 
