@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -20,7 +21,13 @@ from dolfinopt.optimization.measured import (
     STEP_ATTEMPTS,
 )
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step, on_grid
-from dolfinopt.optimization.problem import EvaluatedDesign, Problem, limits_at, problem_of
+from dolfinopt.optimization.problem import (
+    EvaluatedDesign,
+    Problem,
+    eroded_share,
+    limits_at,
+    problem_of,
+)
 from dolfinopt.optimization.residual import Residual, kkt_residual
 from dolfinopt.optimization.state import Best, HistoryRow, Memory, Progress
 from dolfinopt.parallel import on_root, sum_over_arms
@@ -127,9 +134,10 @@ class Iterate:
         """Go on to MMA's next design (collective).
 
         A step whose motion cannot be simulated, or that makes the objective or a limit twice as
-        bad, is made without a steeper projection, then a quarter as long; after four attempts x
-        stays and `stuck` says why. The next steps are half as long where the merit rose, else
-        longer again, but not as long as the projection becomes steeper.
+        bad, or by which the eroded design comes to twice a limit, is made without a steeper
+        projection, then a quarter as long; after four attempts x stays and `stuck` says why. The
+        next steps are half as long where the merit rose, else longer again, but not as long as the
+        projection becomes steeper.
         """
         size = abs(self.problem.f0) or 1.0
         merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
@@ -180,7 +188,9 @@ class Iterate:
             self.evaluator.undo()
             return None
         held = limits_at(self.scene, self.designs)
-        if leaps(self.problem.values, problem_of(self.scene, designs, held).values):
+        tried = problem_of(self.scene, designs, held)
+        shares = [eroded_share(self.scene, known) for known in (self.designs, designs)]
+        if leaps(self.problem.values, tried.values, shares):
             self.evaluator.undo()
             return None
         return designs
@@ -276,15 +286,18 @@ class Iterate:
         self.projection.beta = memory.beta
 
 
-def leaps(before: np.ndarray, after: np.ndarray) -> bool:
+def leaps(before: np.ndarray, after: np.ndarray, eroded: Sequence[float] = (0.0, 0.0)) -> bool:
     """Return whether a step makes things twice as bad, and so leads nowhere.
 
-    Either a limit, or the objective of a design that keeps all.
+    Either a limit, or the objective of a design that keeps all; or the eroded design comes to twice
+    a limit that it need not keep: it is coming apart.
 
     Args:
         before, after: (1 + m,) values of what is minimised and of the relative limits.
+        eroded: `eroded_share` before and after.
     """
     kept = bool((before[1:] <= EXCESS).all())
     up = kept and after[0] > before[0] + abs(before[0])
     far = 1.0 + after[1:] > 2.0 * (1.0 + np.maximum(before[1:], 0.0))
-    return bool(up or far.any() or not np.isfinite(after).all())
+    apart = eroded[0] <= 2.0 < eroded[1]
+    return bool(up or far.any() or apart or not np.isfinite(after).all())

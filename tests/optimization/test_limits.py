@@ -13,7 +13,7 @@ from dolfinopt.optimization import stopping
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.iterate import leaps
 from dolfinopt.optimization.measured import ERODED_LIMIT_FACTOR
-from dolfinopt.optimization.problem import limits_at, problem_of
+from dolfinopt.optimization.problem import eroded_share, limits_at, problem_of
 from dolfinopt.optimization.stopping import StopCode
 from dolfinopt.plots.curves import limits_by_column
 from dolfinopt.responses.constraints import EXCESS, Limit, tightest
@@ -158,6 +158,7 @@ def test_robust_designs_keep_limits_and_the_nominal_one_has_the_mass(bound):
     # The eroded one's limit is wider, up to a factor; each row changes by its own gradient.
     assert limits["deviation"].value == deviations[-1]
     scale = 1.0 / min(deviations[0] / deviations[-1], ERODED_LIMIT_FACTOR)
+    assert eroded_share(built, designs) == pytest.approx(deviations[0] / max(deviations[-1], 0.012))
     expected = [scale * deviations[0] / 0.012 - 1.0, deviations[-1] / 0.012 - 1.0]
     assert own == pytest.approx(expected, rel=1e-9)
     row = designs[0].limited.index("deviation")
@@ -210,6 +211,13 @@ def test_limits_by_the_columns_of_the_history():
 )
 def test_steps_that_lead_nowhere(before, after, astray):
     assert leaps(np.array(before), np.array(after)) == astray
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize(("shares", "astray"), [((1.9, 2.1), True), ((1.9, 2.0), False)])
+def test_the_eroded_design_may_not_come_apart(shares, astray):
+    assert leaps(np.array([1.0, -0.1]), np.array([1.0, -0.1]), shares) == astray
+    assert not leaps(np.ones(1), np.ones(1), (2.5, 2.4))
 
 
 @pytest.mark.serial
