@@ -14,13 +14,14 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,
+    DECIMALS,
     LEAST_REACH,
     NEWTON_ITERATIONS,
     REACH_GROWTH,
     SHORTER_REACH,
     STEP_ATTEMPTS,
 )
-from dolfinopt.optimization.mma import MMAState, initial_state, mma_step, on_grid
+from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
 from dolfinopt.optimization.problem import (
     EvaluatedDesign,
     Problem,
@@ -196,13 +197,13 @@ class Iterate:
         return designs
 
     def _proposed(self, move: float) -> tuple[np.ndarray, MMAState]:
-        """Return MMA's next design, and what it remembers then (collective)."""
+        """Return MMA's next design, rounded, and what it remembers then (collective)."""
         step = partial(mma_step, state=self.state, move=move)
         if self.curved:
             step = partial(step, widest=CURVED_ASYMPTOTE_DISTANCE)
         with self.evaluator.profile.phase("mma"):
             new, after = on_root(self.world, step, *self._posed)
-        return on_grid(new, self.variables.xmin, self.variables.xmax), after
+        return np.clip(new.round(DECIMALS), self.variables.xmin, self.variables.xmax), after
 
     @property
     def _posed(self) -> tuple[np.ndarray, ...]:

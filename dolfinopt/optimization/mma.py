@@ -28,7 +28,6 @@ from dolfinopt.optimization.measured import (
     DEPENDENT_SHARE,
     DUAL_EVALUATIONS,
     FIRST_ASYMPTOTE_DISTANCE,
-    GRID,
     ROUNDING,
 )
 
@@ -146,21 +145,6 @@ def mma_step(
         state.iteration + 1, x, state.x_old1.copy(), x - distance, x + distance, multipliers
     )
     return new, after
-
-
-def on_grid(x: Array, xmin: npt.ArrayLike, xmax: npt.ArrayLike) -> Array:
-    """Return the nearest design (n,) whose variables are multiples of `GRID` of their ranges.
-
-    What rounding has made of a step, other with every processor, is then forgotten: it does not
-    grow from step to step.
-
-    Args:
-        x: (n,) design.
-        xmin, xmax: (n,) or scalar bounds.
-    """
-    low, width = np.asarray(xmin, np.float64), np.subtract(xmax, xmin)
-    steps = np.divide(x - low, GRID * width, out=np.zeros_like(x), where=width > 0.0)
-    return np.asarray(np.clip(low + GRID * width * np.round(steps), xmin, xmax))
 
 
 def _check(x: Array, low: Array, high: Array, f: Array, gradients: Array) -> None:
