@@ -10,9 +10,9 @@ Each with its unit and what it rules; problems as in `dolfinopt bench optimiser`
 SHORTER_REACH = 0.5
 REACH_GROWTH = 1.2  # on it where it did not
 LEAST_REACH = 0.05  # of the scene's move limit
-# Of design variables after a step: what floating-point arithmetic makes of it, up to 1e-10, other on
-# every processor, is forgotten and does not grow. Of 4 800 variables in 75 iterations 0.07 become
-# others, with six decimals 0.7; four leave out small moves.
+# Of design variables after a step: what floating-point arithmetic makes of it on one processor and
+# another, up to 1e-10, is forgotten and does not grow. Of 4 800 variables in 75 iterations 0.07
+# are rounded to another number, with six decimals 0.7; four leave out small moves.
 DECIMALS = 5
 STEP_ATTEMPTS = 4  # the last one 1/64 as long
 # For each time step of the last motion, and each of robust designs, before a design is given up;
