@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+__all__ = [
+    "benchmark_folder",
+    "filled",
+    "mesh_folder",
+    "paper_scene",
+    "tables_of",
+    "template_folder",
+    "tomllib",
+]
 
 
 def mesh_folder() -> Path:
@@ -26,6 +42,11 @@ def paper_scene() -> Path:
 def template_folder() -> Path:
     """Return the folder of the scenes that `dolfinopt init` starts from."""
     return Path(__file__).parent / "scene" / "templates"
+
+
+def tables_of(file: str) -> dict[str, Any]:
+    """Return the content of a TOML file of the package, named from its folder."""
+    return tomllib.loads((Path(__file__).parent / file).read_text(encoding="utf-8"))
 
 
 def filled(template: str, filters: Mapping[str, Callable[..., Any]], **content: Any) -> str:

@@ -19,12 +19,11 @@ import pandas as pd
 from mpi4py import MPI
 from pydantic import ConfigDict, ValidationError
 
-from dolfinopt.data import benchmark_folder
+from dolfinopt.data import benchmark_folder, tomllib
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.model import Model, SimulationResult
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.scene.load import tomllib
 from dolfinopt.scene.tables.base import Table, input_error, problem
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
@@ -19,7 +18,7 @@ from petsc4py import PETSc
 from dolfinopt.arms.arm import Arm
 from dolfinopt.bench.measure import Cells, Plan, arms_of, in_processes, mpirun, timed
 from dolfinopt.bench.panel import Diagram, Frame, Rows, Steps
-from dolfinopt.data import template_folder
+from dolfinopt.data import tables_of, template_folder
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.interior import with_rigid_motions
 from dolfinopt.mesh import compat
@@ -31,7 +30,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import EXCESS, limits_of
 from dolfinopt.responses.evaluation import evaluate
 from dolfinopt.responses.response import objective_of
-from dolfinopt.scene.load import Scene, scene_from_dict, tomllib
+from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.variants import changed
 
 # -- two arms against elements, on ranks, beside plain DOLFINx --------------------------------
@@ -197,8 +196,7 @@ Table = dict[str, Any]
 @cache
 def problems() -> dict[str, Table]:
     """Return the tables of every problem's scene, by its name."""
-    with Path(__file__).with_name("optimiser.toml").open("rb") as file:
-        machines = tomllib.load(file)
+    machines = tables_of("bench/optimiser.toml")
     given = machines.pop("problems")
     motion = machines["pick_and_place"]["motion"]
     motion["file"] = str(template_folder() / motion["file"])

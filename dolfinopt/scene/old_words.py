@@ -9,14 +9,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
+from dolfinopt.data import tables_of
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import input_error, rows
 from dolfinopt.scene.tables.joints import INBOARD, OUTBOARD, site_of
 from dolfinopt.scene.tables.machine import GROUND
-from dolfinopt.scene.toml import tomllib
 
 Tree = dict[str, Any]
 Row = dict[str, Any]
@@ -187,10 +186,7 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "motion.start_angle": _first_joint,
 }
 
-_FILE = Path(__file__).with_name("old_words.toml")
-OLD_WORDS = tuple(
-    OldWord(old, **entry) for old, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
-)
+OLD_WORDS = tuple(OldWord(old, **entry) for old, entry in tables_of("scene/old_words.toml").items())
 
 
 def is_old(path: tuple[Any, ...]) -> bool:

@@ -25,7 +25,6 @@ from dolfinopt.scene.tables.base import (
     Three,
     TwoOrThree,
     Use,
-    setting,
     shown,
     table_in,
 )
@@ -165,116 +164,33 @@ class Arm(Drive):
     )
     BY_DIMENSION = ByDimension(in_space="centre interfaces", numbers="inertia")
 
-    name: Annotated[str, AfterValidator(check_arm_name)] = setting(
-        "unique name, used in files and messages [-]"
-    )
-    length: Extent = setting(
-        "distance from the inboard joint axis to the outboard one, or to the "
-        "end-effector; 0 only of a rigid arm in space [m]"
-    )
-    height: Length = setting("height in the plane of motion [m]")
-    thickness: Length = setting("thickness normal to the plane of motion [m]")
-    cells: TwoOrThree[CellCount] | None = setting(
-        (200, 12),
-        "number of cells along and across a rectangular arm in plane stress; along, "
-        "over the height and over the thickness of a solid one [-]",
-    )
-    mesh: FileName | None = setting(
-        None,
-        "geometry or mesh file (.geo, .msh, .step, of Abaqus and CalculiX .inp) in place of cells; "
-        "or the whole body, not designed, as standard input data (.sid, .sid_fem) [-]",
-    )
-    mesh_size: Length | None = setting(
-        None,
-        "cell size for a .geo or .step file; default: a .geo file's own; with .step a "
-        "twelfth of the height, of solids a quarter of the smaller of height and thickness [m]",
-    )
-    cell_shape: CellShape | None = setting(
-        None,
-        "cell shape for a .geo or .step file; hexahedron and tetrahedron make the arm "
-        "a solid, with a .msh or .inp file, too [-]",
-    )
-    interface_offset: Length | None = setting(
-        None,
-        "how far the middles of the interfaces of a solid mesh file, or hull, may lie "
-        "from the joints at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: "
-        "a twentieth of the larger of height and thickness [m]",
-    )
-    mesh_scale: float = setting(
-        1.0,
-        "length of the mesh file's unit: 0.001 of a file in mm; a .step file states its own [m]",
-        ge=1e-9,
-        le=1e9,
-    )
-    element: ElementName | None = setting(
-        None,
-        'finite element: "incompatible" are quadrilaterals and hexahedra that bend '
-        "without locking; default: these, quadratic triangles and tetrahedra [-]",
-    )
-    passive: Extent | None = setting(
-        None,
-        "length kept solid around both interfaces; default: a quarter of the "
-        "height, at most a tenth of the length; with a mesh file 0, its own groups "
-        "[m]",
-    )
-    symmetric: bool | Literal["z", "yz", "extruded", "y-extruded"] = setting(
-        False,
-        "keep the design symmetric about the arm's axis: true, about y = 0; of a solid "
-        'arm also "z", about z = 0, and "yz", about both; of one made of cells "extruded", the '
-        'same over the thickness, and "y-extruded", about y = 0, too [-]',
-    )
-    hollow: bool | SectionOrFile = setting(
-        False,
-        "a thin-walled link of the arm's extents: the outer surface stays, the design "
-        'is the thickness of the wall; true or "box"; "tube" is round, height = thickness; or a '
-        "mesh file (.msh) of a solid whose outer surface the arm has, which every ray from its "
-        "axis meets once; in space, with cells = [nx, ny, nz], of which those on the surface count "
-        "[-]",
-    )
-    wall: WallThickness | None = setting(None, "initial thickness of the wall of a hollow arm [m]")
-    min_wall: WallThickness | None = setting(
-        None, "least thickness of the wall; default: half of wall [m]"
-    )
-    max_wall: WallThickness | None = setting(
-        None,
-        "largest thickness of the wall, also that of the flanges, rings over passive "
-        "at both ends; default: twice wall [m]",
-    )
-    design: str | None = setting(
-        None,
-        "name of an earlier arm whose design this one has: one mesh and one body for both where "
-        "they are alike but for their joints, else scaled to its own length and height, cell by "
-        "cell [-]",
-    )
-    rigid: bool = setting(False, "a rigid bar of solid material, not optimised [-]")
-    mass: Inertia | None = setting(
-        None,
-        "mass of a rigid arm, its centre halfway; default: that of the solid bar [kg]",
-    )
-    inertia: Inertia | Tensor | None = setting(
-        None,
-        "moment of inertia of a rigid arm about its centre, in space the tensor xx, "
-        "yy, zz, xy, xz, yz; default: that of a bar of its mass [kg m2]",
-    )
-    centre: Three[Position] | None = setting(
-        None, "centre of mass of a rigid arm in space, in the arm's frame; default: halfway [m]"
-    )
-    joint_mass: Inertia = setting(
-        0.0, "mass at the outboard interface: motor, gearbox, bearing [kg]"
-    )
-    joint_inertia: Inertia = setting(0.0, "moment of inertia at the outboard interface [kg m2]")
-    material: CatalogueName | None = setting(
-        None,
-        'name of this arm\'s material in the catalogue, e.g. "steel S355"; default: '
-        "that of [material] [-]",
-    )
-    regions: tuple[Region, ...] = setting((), "parts of the arm that stay solid or void")
-    interfaces: tuple[Interface, ...] = setting(
-        (),
-        "in space: further outboard interfaces, each with six coordinates, on which "
-        "joints or the payload sit, and the bores at the ends of a mesh file; taken from the arm "
-        "whose design this one shares alone, the bores with the mesh of the arm before",
-    )
+    name: Annotated[str, AfterValidator(check_arm_name)]
+    length: Extent
+    height: Length
+    thickness: Length
+    cells: TwoOrThree[CellCount] | None = (200, 12)
+    mesh: FileName | None = None
+    mesh_size: Length | None = None
+    cell_shape: CellShape | None = None
+    interface_offset: Length | None = None
+    mesh_scale: float = Field(default=1.0, ge=1e-9, le=1e9)
+    element: ElementName | None = None
+    passive: Extent | None = None
+    symmetric: bool | Literal["z", "yz", "extruded", "y-extruded"] = False
+    hollow: bool | SectionOrFile = False
+    wall: WallThickness | None = None
+    min_wall: WallThickness | None = None
+    max_wall: WallThickness | None = None
+    design: str | None = None
+    rigid: bool = False
+    mass: Inertia | None = None
+    inertia: Inertia | Tensor | None = None
+    centre: Three[Position] | None = None
+    joint_mass: Inertia = 0.0
+    joint_inertia: Inertia = 0.0
+    material: CatalogueName | None = None
+    regions: tuple[Region, ...] = ()
+    interfaces: tuple[Interface, ...] = ()
 
     _scaled: bool = PrivateAttr(False)
 

@@ -30,6 +30,7 @@ from pydantic import (
     model_validator,
 )
 
+from dolfinopt.data import tables_of
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -96,13 +97,7 @@ def rows(tree: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
     return [row for row in (node if isinstance(node, list) else [node]) if isinstance(row, dict)]
 
 
-def setting(*given: Any, **rules: Any) -> Any:
-    """Return the field of a key: its default, if it has one, and what it means, with the unit.
-
-    Rules are those of pydantic, such as ge and le.
-    """
-    *default, description = given
-    return Field(*default, description=description, **rules)
+MEANINGS = tables_of("scene/keys.toml")  # of every table's keys, with the unit, by its class
 
 
 class Use(NamedTuple):
@@ -149,7 +144,9 @@ class Table(BaseModel):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Put inherited keys behind a table's own; tell what keys are used with."""
+        """Put inherited keys behind a table's own; tell what keys mean and are used with."""
+        for key, meaning in MEANINGS.get(cls.__name__, {}).items():
+            cls.model_fields[key].description = meaning
         for key in [key for key in cls.model_fields if key not in cls.__annotations__]:
             cls.model_fields[key] = cls.model_fields.pop(key)
         for use in cls.USES:

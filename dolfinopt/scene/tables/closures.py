@@ -18,7 +18,6 @@ from dolfinopt.scene.tables.base import (
     Three,
     TwoOrThree,
     Use,
-    setting,
 )
 from dolfinopt.scene.tables.joints import (
     Components,
@@ -61,40 +60,16 @@ class Closures(Table):
         Use("damping", "stiffness"),
     )
 
-    name: Annotated[str, AfterValidator(check_joint_name)] = setting(
-        "unique name; of a rod without length the column of its length in tables [-]"
-    )
-    kind: Kind = setting(
-        "ball (3 equations), pin about an axis (5), slider along an axis that does not "
-        "turn (5), universal of two crossing axes (4), or a rod between two balls (1); in the "
-        "plane pin (2), or slider that may turn (1) [-]"
-    )
-    between: tuple[str, str] = setting(
-        'what it joins: "arm.interface" or "arm" for its outboard one, then another or "ground" [-]'
-    )
-    point: TwoOrThree[Position] = setting(
-        (0.0, 0.0, 0.0), "the joint in the frame of the second interface, or in the world's [m]"
-    )
-    rpy: Three[Angle] = setting(
-        (0.0, 0.0, 0.0),
-        "roll, pitch and yaw of the joint's frame there, as of [[joints]]; zero: "
-        "parallel to the first interface's frame [rad]",
-    )
-    axis: Line | Three[Component] | None = setting(
-        None,
-        "of a pin in space, a slider, or the universal joint's axis on the second "
-        "interface, in the joint's frame, of any length [-]",
-    )
-    cross_axis: Direction | None = setting(
-        None, "the universal joint's axis on the first interface, across the other one [-]"
-    )
-    length: Length | None = setting(
-        None,
-        "of a rod; default: it is driven, its length a column of the motion's table, "
-        "or what the path asks for [m]",
-    )
-    stiffness: Stiffness = setting(0.0, "of a rod that is a spring; 0: it is rigid [N/m]")
-    damping: Stiffness = setting(0.0, "of a rod that is a spring [N s/m]")
+    name: Annotated[str, AfterValidator(check_joint_name)]
+    kind: Kind
+    between: tuple[str, str]
+    point: TwoOrThree[Position] = (0.0, 0.0, 0.0)
+    rpy: Three[Angle] = (0.0, 0.0, 0.0)
+    axis: Line | Three[Component] | None = None
+    cross_axis: Direction | None = None
+    length: Length | None = None
+    stiffness: Stiffness = 0.0
+    damping: Stiffness = 0.0
 
     @property
     def driven(self) -> bool:

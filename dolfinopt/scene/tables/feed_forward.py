@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from dolfinopt.scene.tables.base import Duration, Instant, Refusal, Table, Use, setting, shown
+from dolfinopt.scene.tables.base import Duration, Instant, Refusal, Table, Use, shown
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -17,24 +17,10 @@ class FeedForward(Table):
 
     USES = (Use("joints spacing lead", "kind", "tip"),)
 
-    kind: Literal["none", "tip"] = setting(
-        "none", '"tip": joints move so that the tip of the bending arms follows the path [-]'
-    )
-    joints: tuple[str, ...] | None = setting(
-        None,
-        "names of the driven joints that are corrected; default: as many as the path "
-        "has components, those that move the tip best [-]",
-    )
-    spacing: Duration | None = setting(
-        None,
-        "largest distance between the knots of the corrections' splines; default: as "
-        "small as it takes to leave a ten thousandth of the deviation [s]",
-    )
-    lead: Instant | None = setting(
-        None,
-        "time before and after the motion in which joints may already, or still, be "
-        "corrected; the path begins after it; default: 5 % of motion.duration [s]",
-    )
+    kind: Literal["none", "tip"] = "none"
+    joints: tuple[str, ...] | None = None
+    spacing: Duration | None = None
+    lead: Instant | None = None
 
     @property
     def on(self) -> bool:

@@ -23,7 +23,6 @@ from dolfinopt.scene.tables.base import (
     TwoOrThree,
     Use,
     refuse_count,
-    setting,
     shown,
 )
 from dolfinopt.scene.tables.joints import (
@@ -62,47 +61,18 @@ class Joint(Drive):
 
     USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"), *OF_PARTS)
 
-    name: Annotated[str, AfterValidator(check_joint_name)] = setting(
-        "unique name, the column of its coordinate in tables, of a rod without length of that [-]"
-    )
-    type: JointType = setting("what moves: an angle, a distance, or nothing [-]")
-    parent: str = setting(
-        'what it sits on: "arm" for its outboard interface, "arm.interface" for one of '
-        'arms.interfaces, or "ground" [-]'
-    )
-    child: str = setting("name of the arm that it holds, whose frame is the joint's [-]")
-    axis: Direction | None = setting(
-        None, "axis in the joint's frame, of any length; of revolute and prismatic ones [-]"
-    )
-    origin: Three[Position] = setting(
-        (0.0, 0.0, 0.0),
-        "origin of the joint's frame in the parent's interface frame, or in the world's [m]",
-    )
-    rpy: Three[Angle] = setting(
-        (0.0, 0.0, 0.0),
-        "roll, pitch and yaw about the fixed axes x, y and z that place the joint's "
-        "frame, as in URDF [rad]",
-    )
-    passive: bool = setting(
-        False, "whether it has no drive and follows from the others by [[closures]] [-]"
-    )
+    name: Annotated[str, AfterValidator(check_joint_name)]
+    type: JointType
+    parent: str
+    child: str
+    axis: Direction | None = None
+    origin: Three[Position] = (0.0, 0.0, 0.0)
+    rpy: Three[Angle] = (0.0, 0.0, 0.0)
+    passive: bool = False
 
-    position_limits: tuple[Position, Position] | None = setting(
-        None,
-        "least and largest coordinate, as in URDF; a warning tells where the motion "
-        "exceeds them [rad, m]",
-    )
-    velocity_limit: DriveForce | None = setting(
-        None,
-        "largest rate of the coordinate either way, as in URDF; a warning tells where "
-        "the motion exceeds it [rad/s, m/s]",
-    )
-    effort_limit: DriveForce | None = setting(
-        None,
-        "largest torque or force of the drive either way, as in URDF; a warning tells "
-        "where the motion asks for more. The optimiser keeps control.limits and "
-        "constraints.peak_force [N m, N]",
-    )
+    position_limits: tuple[Position, Position] | None = None
+    velocity_limit: DriveForce | None = None
+    effort_limit: DriveForce | None = None
 
     @property
     def parent_arm(self) -> str:
@@ -217,31 +187,11 @@ FeedForward = Literal["rigid", "elastic", "tip", "none"]
 class Control(Table):
     """Feed-forward and feedback that drive the rigid coordinates instead of prescribing them."""
 
-    feed_forward: FeedForward = setting(
-        "rigid",
-        "forces known in advance: inverse dynamics of the machine with rigid arms of "
-        'the current design, its rotors and friction included; "elastic" also asks motors behind '
-        "gear_stiffness to turn ahead of their joints by what the gears give; "
-        '"tip": those of [feed_forward], with its joints as desired ones; or none [-]',
-    )
-    stiffness: tuple[Stiffness, ...] = setting(
-        "proportional gain of every driven coordinate, the cart first, then the joints "
-        "from the base outwards [N/m, N m/rad]"
-    )
-    damping: tuple[Stiffness, ...] = setting(
-        "derivative gain of every driven coordinate [N s/m, N m s/rad]"
-    )
-    limits: tuple[DriveForce, ...] | None = setting(
-        None,
-        "largest force of every drive: up to 95 % of its limit a drive gives what the "
-        "control asks for, from 105 % on the limit, with a smooth transition between them "
-        "(three times continuously differentiable); default: none [N, N m]",
-    )
-    forces: FileName | None = setting(
-        None,
-        "table (CSV) of forces that are added, with columns t, cart and the arms' "
-        "names; zero behind its last row [N, N m]",
-    )
+    feed_forward: FeedForward = "rigid"
+    stiffness: tuple[Stiffness, ...]
+    damping: tuple[Stiffness, ...]
+    limits: tuple[DriveForce, ...] | None = None
+    forces: FileName | None = None
 
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse gains and limits that are not one for every driven coordinate."""
@@ -264,9 +214,7 @@ class Control(Table):
 class Damping(Table):
     """Structural damping D = stiffness_proportional * K."""
 
-    stiffness_proportional: float = setting(
-        2e-4, "factor d of the damping matrix D = d K [s]", ge=0, le=1e3
-    )
+    stiffness_proportional: float = Field(default=2e-4, ge=0, le=1e3)
 
 
 # -- `[payload]` ---------------------------------------------------------------------------------
@@ -276,20 +224,10 @@ class Payload(Table):
     """What the end-effector carries."""
 
     BY_DIMENSION = ByDimension(in_space="offset arm", numbers="inertia")
-    mass: Inertia = setting("point mass at the end-effector [kg]")
-    inertia: Inertia | Tensor = setting(
-        0.0,
-        "moment of inertia about its centre; in space about every axis, or the tensor "
-        "xx, yy, zz, xy, xz, yz [kg m2]",
-    )
-    offset: Three[Position] = setting(
-        (0.0, 0.0, 0.0), "its centre in the frame of the end-effector's interface; in space [m]"
-    )
-    arm: str | None = setting(
-        None,
-        '"arm" or "arm.interface" that carries it and is the end-effector, whose '
-        "deviation and path count; default: the last one; in space [-]",
-    )
+    mass: Inertia
+    inertia: Inertia | Tensor = 0.0
+    offset: Three[Position] = (0.0, 0.0, 0.0)
+    arm: str | None = None
 
     @property
     def moment(self) -> float:
@@ -321,33 +259,14 @@ class Force(Table):
     """A force and a moment on an interface of an arm, constant or from a table over time."""
 
     BY_DIMENSION = ByDimension(numbers="moment", vectors="force")
-    name: Annotated[str, AfterValidator(check_joint_name)] | None = setting(
-        None, "unique name, by which changes may call it [-]"
-    )
-    arm: str = setting('what it acts on: "arm" for its outboard interface, or "arm.interface" [-]')
-    force: Vector | None = setting(
-        None, "constant force on the interface's point: x, y, in space x, y, z [N]"
-    )
-    moment: GivenMoment | None = setting(
-        None, "constant moment: in the plane a number, in space about x, y, z [N m]"
-    )
-    table: FileName | None = setting(
-        None,
-        "table (CSV) over time, added to force and moment, with columns t, fx, fy, mz, "
-        "in space t, fx, fy, fz, mx, my, mz; straight between its rows, zero behind the last "
-        "[s, N, N m]",
-    )
-    factor: float = setting(
-        1.0, "factor on force, moment and table, to be varied in studies [-]", ge=-1e12, le=1e12
-    )
-    frame: ForceFrame = setting(
-        "world",
-        "whose directions x, y, z are: the world's, or the arm's, whose x leads from "
-        "the inboard joint to the undeformed outboard one [-]",
-    )
-    feed_forward: bool = setting(
-        True, "the feed-forward of [control] knows it; false: a disturbance [-]"
-    )
+    name: Annotated[str, AfterValidator(check_joint_name)] | None = None
+    arm: str
+    force: Vector | None = None
+    moment: GivenMoment | None = None
+    table: FileName | None = None
+    factor: float = Field(default=1.0, ge=-1e12, le=1e12)
+    frame: ForceFrame = "world"
+    feed_forward: bool = True
 
     def check_table(self) -> None:
         if self.force is None and self.moment is None and self.table is None:
