@@ -24,12 +24,14 @@ from dolfinopt.cli.shared import (
 )
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import ending_at_once
+from dolfinopt.output.folders import check_new, write_new
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.exchange.urdf.scene import RobotScene
-    from dolfinopt.scene.load import Scene
 
 
 @click.command(name="import")
@@ -98,8 +100,6 @@ def _write_scene(
 ) -> None:
     """Write scene, table and record, and say what they are."""
     from dolfinopt.loading import load_scene
-    from dolfinopt.output.folders import check_new, write_new
-    from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
     *_, name = new
     path, kept = folder / name, ", or --overwrite to replace the import; an edited scene is kept"

@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from io import StringIO
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -32,13 +32,16 @@ from dolfinopt.cli.studies import (
     uncertainty,
 )
 from dolfinopt.data import template_folder
+from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import launched_rank
+from dolfinopt.output.folders import write_new
+from dolfinopt.scene.load import describe_keys
+from dolfinopt.scene.materials import CATALOGUE
+from dolfinopt.scene.messages import KeyInfo
+from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
+from dolfinopt.scene.tables.base import Refusal
 from dolfinopt.version import __version__
-
-if TYPE_CHECKING:
-    from dolfinopt.scene.messages import KeyInfo
-
 
 # -- `dolfinopt init` ----------------------------------------------------------------------------
 
@@ -62,9 +65,6 @@ def init(name: Path, template: str, older: str | None) -> None:
     if launched_rank():  # the root does it
         return
     template = older or template
-    from dolfinopt.output.folders import write_new
-    from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
-    from dolfinopt.scene.tables.base import Refusal
 
     path = name if name.suffix == ".toml" else name.with_name(f"{name.name}.toml")
     try:
@@ -108,8 +108,6 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
     or match its wildcards ("arms.*"); without PATTERN of all keys. "dolfinopt keys material" lists
     the materials of the catalogue, too, and "dolfinopt keys steel" those whose name contains it.
     """
-    from dolfinopt.scene.load import describe_keys
-    from dolfinopt.scene.schema import scene_schema
 
     if upgrade is not None:
         _upgrade(upgrade)
@@ -134,7 +132,6 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
 
 def _upgrade(scene: Path) -> None:
     """Rewrite a scene's file in the words of now, and say what changed."""
-    from dolfinopt.disk import write_text
     from dolfinopt.scene.upgrade import upgraded
 
     text, told = upgraded(os.fspath(scene))
@@ -161,7 +158,6 @@ def _fits(info: KeyInfo, pattern: str | None) -> bool:
 
 def _materials(pattern: str | None, infos: list[KeyInfo]) -> list[str]:
     """Return a line for every material of the catalogue whose name, or whose key, was asked for."""
-    from dolfinopt.scene.materials import CATALOGUE
 
     if pattern is None:
         return []

@@ -32,7 +32,9 @@ from dolfinopt.cli.shared import (
 )
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.optimization.measured import PASSING_RATE
+from dolfinopt.output.folders import check_unused, remove_stale, working_alone
 from dolfinopt.progress import with_unit
+from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -40,7 +42,6 @@ if TYPE_CHECKING:
     from dolfinopt.optimization.result import RankResult
     from dolfinopt.output.design import Designed
     from dolfinopt.profiling import Profile
-    from dolfinopt.scene.load import Scene
 
 
 @click.command()
@@ -68,7 +69,6 @@ def optimize(
     tell_assumed(world, loaded)
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
-    from dolfinopt.output.folders import working_alone
     from dolfinopt.output.run_folder import optimize as run
     from dolfinopt.parallel import on_root
 
@@ -154,7 +154,6 @@ def simulate(
     tell_assumed(world, loaded)
     folder = out or Path("results") / f"{scene.stem}-simulation"
     from dolfinopt.output.design import arms_with_design, under_law_of
-    from dolfinopt.output.folders import check_unused, remove_stale, working_alone
     from dolfinopt.output.run_folder import simulated
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile

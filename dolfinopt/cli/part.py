@@ -25,13 +25,14 @@ from dolfinopt.cli.shared import (
     warn,
 )
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.output.folders import prepare_folder
+from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.part.check import Check
     from dolfinopt.part.folder import Saved
     from dolfinopt.part.optimize import Keep, Optimized
     from dolfinopt.part.part import Meshes, Part
-    from dolfinopt.scene.load import Scene
     from dolfinopt.scene.tables.design import Part as Asked
 
 
@@ -228,7 +229,6 @@ class PartsJob:
 
     def write(self, run: Path, target: Path, plots: bool) -> None:
         """Write the files, all or none."""
-        from dolfinopt.output.folders import prepare_folder
         from dolfinopt.part.folder import write_parts
 
         prepare_folder(target)

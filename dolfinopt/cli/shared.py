@@ -34,6 +34,10 @@ from dolfinopt.output.folders import (
     prepare_folder,
     stale_parts,
 )
+from dolfinopt.progress import show_slow_work
+from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
+from dolfinopt.scene.messages import assumed
+from dolfinopt.scene.schema import found_again
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -42,7 +46,6 @@ if TYPE_CHECKING:
     from dolfinopt.optimization.state import HistoryRow
     from dolfinopt.output.design import ArmView
     from dolfinopt.responses.order_selection import OrderSelection
-    from dolfinopt.scene.load import Scene
 
 
 def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
@@ -50,7 +53,6 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
 
     A process alone finds a wrong key before MPI and the solvers are loaded.
     """
-    from dolfinopt.scene.load import read_scene
 
     if launched_rank() is None:
         read_scene(path, overrides)
@@ -113,8 +115,6 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
 
 def scene_of(folder: Path, overrides: tuple[str, ...] = ()) -> Scene:
     """Return the scene of a run, with the coordinates and stiffening that it came to."""
-    from dolfinopt.scene.load import scene_from_dict
-    from dolfinopt.scene.schema import found_again
 
     path = folder / "summary.json"
     try:
@@ -188,7 +188,6 @@ def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
 
 def tell_assumed(world: MPI.Comm, scene: Scene) -> None:
     """Print in one line what the scene does not state and its results depend on."""
-    from dolfinopt.scene.messages import assumed
 
     if world.rank == 0 and (line := assumed(scene)):
         click.echo(line)
@@ -303,7 +302,6 @@ class Start:
             from mpi4py import MPI
 
             from dolfinopt.parallel import abort_together
-            from dolfinopt.progress import show_slow_work
 
             self._world = MPI.COMM_WORLD
             show_slow_work()

@@ -24,12 +24,15 @@ from dolfinopt.cli.shared import (
     start,
     warn,
 )
+from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.output.folders import read_record
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import file_digest, with_digests
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.scene.load import Scene
     from dolfinopt.study.cases import Steps
     from dolfinopt.study.tables import Study
 
@@ -107,7 +110,6 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
 
 def _asked(scene: Scene, designs: Sequence[Path]) -> dict[str, Any]:
     """Return what tells one study from another: scene and designs, files by their content."""
-    from dolfinopt.scene.schema import file_digest, with_digests
 
     known = [file_digest(path) if path.is_file() else str(path) for path in designs]
     return {"scene": with_digests(scene.to_dict()), "designs": known}
@@ -137,14 +139,12 @@ def _write_question(
     folder: Path, name: str, question: Mapping[str, Any], files: Sequence[str]
 ) -> None:
     """Write what a study asked, and its files, as FOLDER/NAME.json."""
-    from dolfinopt.disk import write_text
 
     text = json.dumps({"question": question, "files": sorted(files)}, indent=1)
     write_text(folder / f"{name}.json", text + "\n")
 
 
 def _record(folder: Path, name: str) -> dict[str, Any]:
-    from dolfinopt.output.folders import read_record
 
     return read_record(folder / f"{name}.json")
 
@@ -352,7 +352,6 @@ def _check_field(
 ) -> None:
     """Run cases of the benchmark on the root; print each one's values when it is done."""
     from dolfinopt.bench.field import check, chosen_cases, table_of
-    from dolfinopt.disk import write_text
     from dolfinopt.parallel import on_root
 
     result = []
