@@ -63,7 +63,9 @@ def _templates() -> Any:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     here = Path(__file__).parent
-    folders = [here / room / "pages" for room in ("study", "paper", "exchange", "exchange/urdf")]
+    folders = [
+        here / room / "pages" for room in ("cli", "study", "paper", "exchange", "exchange/urdf")
+    ]
     return Environment(
         loader=FileSystemLoader(folders),
         autoescape=lambda name: str(name).endswith(".html"),
