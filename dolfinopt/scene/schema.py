@@ -23,9 +23,16 @@ from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, table_in
 from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
-from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
 from dolfinopt.scene.tables.joints import place_of
-from dolfinopt.scene.tables.machine import Control, Damping, Force, Joint, Payload
+from dolfinopt.scene.tables.machine import (
+    LEAD_SHARE,
+    Control,
+    Damping,
+    FeedForward,
+    Force,
+    Joint,
+    Payload,
+)
 from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction, Simulation
 from dolfinopt.scene.tables.objective import Constraints, Limit, Objective, Scenario

@@ -1,4 +1,4 @@
-"""Joints, control, damping, payload, forces: what holds, moves and loads a machine."""
+"""Joints, control, feed-forward, damping, payload, forces: what holds and moves a machine."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from dolfinopt.scene.tables.base import (
     ByDimension,
     Component,
     DriveForce,
+    Duration,
     FileName,
     Inertia,
+    Instant,
     Position,
     Refusal,
     Stiffness,
@@ -181,13 +183,13 @@ def _check_machine(scene: Scene) -> None:
 
 # -- `[control]` ---------------------------------------------------------------------------------
 
-FeedForward = Literal["rigid", "elastic", "tip", "none"]
+Known = Literal["rigid", "elastic", "tip", "none"]
 
 
 class Control(Table):
     """Feed-forward and feedback that drive the rigid coordinates instead of prescribing them."""
 
-    feed_forward: FeedForward = "rigid"
+    feed_forward: Known = "rigid"
     stiffness: tuple[Stiffness, ...]
     damping: tuple[Stiffness, ...]
     limits: tuple[DriveForce, ...] | None = None
@@ -206,6 +208,52 @@ class Control(Table):
             raise Refusal('expected "rigid" without feed_forward.kind = "tip"', ".feed_forward")
         for key in ("stiffness", "damping", "limits"):
             refuse_count(getattr(self, key), scene.driven, f".{key}")
+
+
+# -- `[feed_forward]`: joint motions under which the bending arms carry the tip along its path ---
+
+LEAD_SHARE = 0.05  # of the motion's duration: pre-actuation fades within milliseconds
+
+
+class FeedForward(Table):
+    """Corrections of joints that keep the tip of the flexible machine on the rigid one's path."""
+
+    USES = (Use("joints spacing lead", "kind", "tip"),)
+
+    kind: Literal["none", "tip"] = "none"
+    joints: tuple[str, ...] | None = None
+    spacing: Duration | None = None
+    lead: Instant | None = None
+
+    @property
+    def on(self) -> bool:
+        """Whether joints are corrected."""
+        return self.kind != "none"
+
+    def check_in_scene(self, scene: Scene) -> None:
+        """Refuse what nothing uses, joints that are no drives, and motions without a free tip."""
+        if not self.on:
+            return
+        if scene.control is not None and scene.control.feed_forward != "tip":
+            raise Refusal(
+                'expected "none" with [control], unless control.feed_forward = "tip"',
+                ".kind",
+                "control.feed_forward",
+            )
+        if scene.is_pinned:
+            raise Refusal(
+                'expected "none": a pin holds the end-effector, which has no path', ".kind"
+            )
+        if scene.motion.table_ends == "moving":
+            raise Refusal(
+                'expected "rest" with feed_forward.kind = "tip", whose corrections begin at rest',
+                "motion.table_ends",
+                ".kind",
+            )
+        for name in self.joints or ():
+            if name not in scene.driven:
+                known = ", ".join(scene.driven)
+                raise Refusal(f"expected drives, of {known}; {shown(name)} is none", ".joints")
 
 
 # -- `[damping]` ---------------------------------------------------------------------------------
