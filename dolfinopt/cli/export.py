@@ -194,7 +194,11 @@ def export_robot(
         if world.rank == 0:
             with ending_at_once():
                 files, said = _robot_files(scene, origin, folder, links)
-            _write_robot(folder, pages | files, origin.file.name)
+            prepare_folder(folder)
+            with working_in(folder):
+                remove_stale(folder, [origin.file.name, *PAGES])
+                for name, data in (pages | files).items():
+                    write_bytes(folder / name, data)  # the robot last: the others belong to it
             click.echo("\n".join([*said, *filter(None, [figures])]))
 
 
@@ -258,15 +262,6 @@ def _reduced(world: MPI.Comm, scene: Scene, design: Path | None) -> dict[int, Sh
     with together(world):
         mine = {k: arm.reduce(place.x_phys[k]) for k, arm in place.arms.items()}
     return gather_arms(place.partition, mine)
-
-
-def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
-    """Write all files, the robot last: where it is, the others belong to it (root only)."""
-    prepare_folder(folder)
-    with working_in(folder):
-        remove_stale(folder, [robot, *PAGES])
-        for name, data in files.items():
-            write_bytes(folder / name, data)
 
 
 # -- before and after ------------------------------------------------------------------------

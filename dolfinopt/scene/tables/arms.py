@@ -580,17 +580,11 @@ class Arm(Drive):
         index = scene.places[self.name]
         before = scene.arms[:index]
         if not scene.is_spatial:
-            self._check_files(before)
-            self.check_plane_bearing()
-        if self.is_solid and self.flexible and not scene.is_spatial:
-            raise Refusal(
-                "expected two integers (along, across) of an arm in plane stress: a solid arm "
-                "moves in space, and needs [[joints]]",
-                ".cells" if self.cells is not None else ".cell_shape",
-            )
+            self._check_in_plane(before)
         if self.flexible:
             self._check_material(scene, index)
-        self._check_inertia(scene)
+        if problem := tensor_problem(self.inertia):
+            raise Refusal(problem, ".inertia")
         check_interfaces(scene, index)
         check_motor(scene, index)
         check_regions(self)
@@ -616,9 +610,19 @@ class Arm(Drive):
             )
             raise Refusal(refusal.reason, *keys) from None
 
-    def _check_files(self, before: tuple[Arm, ...]) -> None:
-        """Refuse a name with which two files of a part would be one, such as a_face.step."""
-        own = self.name.casefold()
+    def _check_in_plane(self, before: tuple[Arm, ...]) -> None:
+        """Refuse what moves in space alone, and names with which files of parts would be one."""
+        self.check_plane_bearing()
+        if self.length == 0.0:
+            reason = "expected more than 0 without [[joints]]: the machine moves in the plane"
+            raise Refusal(reason, ".length")
+        if self.is_solid and self.flexible:
+            raise Refusal(
+                "expected two integers (along, across) of an arm in plane stress: a solid arm "
+                "moves in space, and needs [[joints]]",
+                ".cells" if self.cells is not None else ".cell_shape",
+            )
+        own = self.name.casefold()  # as a_face.step
         for other in (arm.name.casefold() for arm in before):
             for longer, shorter in ((own, other), (other, own)):
                 if longer.removeprefix(shorter) in PART_FILES:
@@ -627,14 +631,6 @@ class Arm(Drive):
                         "behind it: files of both parts would have one name",
                         ".name",
                     )
-
-    def _check_inertia(self, scene: Scene) -> None:
-        """Refuse an arm in the plane without length, and inertia that no body has."""
-        if problem := tensor_problem(self.inertia):
-            raise Refusal(problem, ".inertia")
-        if self.length == 0.0 and not scene.is_spatial:
-            reason = "expected more than 0 without [[joints]]: the machine moves in the plane"
-            raise Refusal(reason, ".length")
 
     def _check_design(self, before: tuple[Arm, ...]) -> None:
         """Refuse a design of no arm before it, or whose cells are not this arm's one by one."""

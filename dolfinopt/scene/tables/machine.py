@@ -116,12 +116,11 @@ class Joint(Drive):
                 )
         if len(before) == len(scene.joints) - 1:
             _check_tree(scene)
-            _check_passive(scene)
             _check_machine(scene)
 
 
 def _check_tree(scene: Scene) -> None:
-    """Refuse arms without a joint, and joints that do not lead to the ground."""
+    """Refuse arms without a joint, joints that do not lead to the ground or that nothing moves."""
     parents = {joint.child: joint.parent_arm for joint in scene.joints}
     for k, arm in enumerate(scene.arms):
         if arm.name == GROUND:
@@ -134,6 +133,9 @@ def _check_tree(scene: Scene) -> None:
                 "expected one of [[joints]] whose child it is", f"arms.{k}.name", "joints"
             )
     for i, joint in enumerate(scene.joints):
+        if not scene.closures:
+            reason = "without [[closures]]: no loop moves the joint"
+            joint.refuse_stated(f"joints.{i}.passive", reason)
         passed, above = [joint.child], joint.parent_arm
         while above != GROUND and above not in passed:
             passed.append(above)
@@ -146,13 +148,6 @@ def _check_tree(scene: Scene) -> None:
             )
     if not any(joint.moves for joint in scene.joints):
         raise Refusal('expected a "revolute" or "prismatic" joint: nothing moves', "joints.0.type")
-
-
-def _check_passive(scene: Scene) -> None:
-    """Refuse joints without drives where no loop moves them."""
-    for i, joint in enumerate(scene.joints if not scene.closures else ()):
-        reason = "without [[closures]]: no loop moves the joint"
-        joint.refuse_stated(f"joints.{i}.passive", reason)
 
 
 def _check_machine(scene: Scene) -> None:

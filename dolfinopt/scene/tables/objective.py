@@ -121,7 +121,10 @@ class Objective(Table):
             raise Refusal("expected a number above 0 for one drive at least", ".effort_weights")
         self._check_unused(scene)
         self._check_attached(scene)
-        self._check_static(scene)
+        count = 6 if scene.is_spatial else 3
+        if any(len(load) != count for load in self.static_loads(scene)):
+            what = "six numbers, force and moment, with" if count == 6 else "three numbers without"
+            raise Refusal(f"expected arrays of {what} [[joints]]", "objective.loads")
         self._check_load_cases(scene)
         self._check_lightest(scene)
         if not need_of(scene, "motion"):
@@ -173,13 +176,6 @@ class Objective(Table):
         """Return the static load cases of the scene's arms."""
         default = type(self).model_fields["loads"].default
         return SPATIAL_LOADS if scene.is_spatial and self.loads == default else self.loads
-
-    def _check_static(self, scene: Scene) -> None:
-        """Refuse loads of arms in the plane on solids, and the other way round."""
-        count = 6 if scene.is_spatial else 3
-        if any(len(load) != count for load in self.static_loads(scene)):
-            what = "six numbers, force and moment, with" if count == 6 else "three numbers without"
-            raise Refusal(f"expected arrays of {what} [[joints]]", "objective.loads")
 
     def _check_load_cases(self, scene: Scene) -> None:
         horizon = scene.motion.horizon
