@@ -12,13 +12,10 @@ import click
 
 from dolfinopt.cli.shared import (
     PATH,
-    design_option,
     load,
-    out_option,
-    overwrite_option,
+    options,
     scene_argument,
     scene_of,
-    set_option,
     start,
     warn,
 )
@@ -37,25 +34,7 @@ if TYPE_CHECKING:
 @click.command(name="import")
 @click.argument("robot", type=PATH)
 @click.argument("words", nargs=-1, metavar="TABLE LINK...")
-@click.option(
-    "--tool", metavar="LINK", help="end-effector; default: end of the chosen links' chain"
-)
-@click.option(
-    "--package-path",
-    hidden=True,  # older than ROS_PACKAGE_PATH here
-    multiple=True,
-    type=click.Path(exists=True, file_okay=False),
-)
-@click.option(
-    "--closures",
-    type=PATH,
-    metavar="FILE",
-    help="table (TOML) of closed loops, which URDF cannot state: joints that are passive, and "
-    "[[closures]] with links and points in their frames",
-)
-@click.option("--boxes", is_flag=True, help="solid boxes, whatever the links' geometry")
-@overwrite_option
-@out_option("the scene; default: ROBOT without its ending")
+@options("import")
 def import_robot(
     robot: Path,
     words: tuple[str, ...],
@@ -151,17 +130,7 @@ FORMATS = {"bodies": ("design", "set"), "robot": (), "state-space": ("design", "
 @scene_argument
 @click.argument("kind", type=click.Choice(list(FORMATS)), default="bodies", metavar="[WHAT]")
 @click.argument("last", required=False, metavar="[T | BEFORE]")
-@design_option
-@out_option("the files; default: results/SCENE-WHAT, or urdf or state-space in the folder of a run")
-@overwrite_option
-@set_option
-@click.option(
-    "--below",
-    type=click.FloatRange(min=0.0, min_open=True),
-    metavar="HZ",
-    help="of state-space: take as many coordinates as poles below this frequency need to be within "
-    "1 %; default: those of the scene",
-)
+@options("export")
 def export(
     scene: Path,
     kind: str,

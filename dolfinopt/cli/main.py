@@ -20,7 +20,7 @@ import click
 from dolfinopt.cli.exchange import export, import_robot
 from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.shared import PATH, Start, end_before_start, warn
+from dolfinopt.cli.shared import PATH, Start, end_before_start, options, warn
 from dolfinopt.cli.studies import (
     CHECK,
     COARSE,
@@ -60,7 +60,7 @@ TEMPLATES = {
 )
 @click.argument("name", default="scene", type=PATH)
 @click.argument("template", type=click.Choice(list(TEMPLATES)), default="two-arm")
-@click.option("--template", "older", hidden=True, type=click.Choice(list(TEMPLATES)))
+@options("init")
 def init(name: Path, template: str, older: str | None) -> None:
     if launched_rank():  # the root does it
         return
@@ -94,13 +94,7 @@ def init(name: Path, template: str, older: str | None) -> None:
 
 @click.command()
 @click.argument("pattern", required=False)
-@click.option("--schema", is_flag=True, help="print the JSON schema of scene files, for editors")
-@click.option(
-    "--upgrade",
-    type=PATH,
-    metavar="SCENE",
-    help="rewrite the older words of a scene's file, which is kept as SCENE.old",
-)
+@options("keys")
 def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
     """Explain the keys of a scene.
 
@@ -308,10 +302,7 @@ class _Commands(click.Group):
     no_args_is_help=False,
 )
 @click.version_option(__version__, prog_name="dolfinopt")
-@click.option("--plots/--no-plots", default=True, help="draw pictures, of every command that does")
-@click.option(
-    "--verbose", is_flag=True, help="also tell grayness, contacts and the optimality check"
-)
+@options("commands")
 @click.pass_context
 def commands(ctx: click.Context, plots: bool, verbose: bool) -> None:
     """Stiffen the flexible arms of a moving machine by topology optimisation.

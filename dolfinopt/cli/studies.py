@@ -12,15 +12,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dolfinopt.cli.shared import (
-    PATH,
     load,
-    out_option,
-    overwrite_option,
-    plots_option,
+    options,
     prepare,
     progress,
     scene_argument,
-    set_option,
     start,
     warn,
 )
@@ -42,16 +38,6 @@ COMPARED = {"objectives": "objective", "reductions": "reduction"}
 SECTIONS, MOTIONS = "sections", "motions"
 # Variants of the paper's scene; and to demand its main statements of these, too.
 COARSE, FITTED, CHECK = "coarse", "fitted", "check"
-
-designs_option = click.option(
-    "--design",
-    "designs",
-    multiple=True,
-    metavar="FILE",
-    type=PATH,
-    help="design.npz, any number of times; default: the initial and the optimised design",
-)
-
 
 # What a command asks: name of the study's files, design.npz files, the study's steps in a folder,
 # and what else it asks, but for the values it goes through, which may grow.
@@ -101,10 +87,7 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
             more = f" (and {len(done.failures) - 1} more)" if len(done.failures) > 1 else ""
             raise ConvergenceError(f"{done.failures[0]}{more}")
 
-    decorated: Callable[..., None] = command
-    out = out_option("tables, pictures and cases; default: results/SCENE-study")
-    for option in (plots_option, set_option, overwrite_option, out):
-        decorated = option(decorated)
+    decorated: Callable[..., None] = options("study")(command)
     return decorated
 
 
@@ -152,15 +135,7 @@ def _record(folder: Path, name: str) -> dict[str, Any]:
 @click.command()
 @scene_argument
 @click.argument("preset", required=False, type=click.Choice(PRESETS))
-@click.option(
-    "--vary",
-    multiple=True,
-    metavar="KEY=VALUES",
-    help="a scene value and start:stop:count or a,b,c; two make a grid",
-)
-@designs_option
-@click.option("--reoptimize", is_flag=True, help="optimise a design for every value, too")
-@click.option("--keep", is_flag=True, help="keep the folder of every simulation in DIR/cases")
+@options("sweep")
 @study_command
 def sweep(
     scene: Scene,
@@ -185,14 +160,7 @@ def sweep(
 @scene_argument
 @click.argument("what", type=click.Choice([*COMPARED, SECTIONS, MOTIONS]))
 @click.argument("kinds", nargs=-1, metavar="[KIND...]")
-@click.option(
-    "--design",
-    "designs",
-    multiple=True,
-    metavar="FILE",
-    type=PATH,
-    help="design.npz for sections or motions; default: the optimised design",
-)
+@options("compare")
 @study_command
 def compare(
     scene: Scene,
@@ -231,17 +199,7 @@ def compare(
 
 @click.command()
 @scene_argument
-@click.option(
-    "--random",
-    multiple=True,
-    required=True,
-    metavar="KEY=LAW",
-    help="a scene value's distribution: normal:MEAN:DEVIATION, uniform:LOW:HIGH, "
-    "triangular:LOW:MODE:HIGH or lognormal:MEDIAN:SIGMA; several are independent",
-)
-@click.option("--samples", type=int, default=1000, show_default=True, help="number of samples")
-@click.option("--seed", type=int, default=1, show_default=True, help="seed of the random numbers")
-@designs_option
+@options("uncertainty")
 @study_command
 def uncertainty(
     scene: Scene, random: tuple[str, ...], designs: tuple[Path, ...], samples: int, seed: int
@@ -259,9 +217,7 @@ def uncertainty(
 
 @click.command()
 @click.argument("variants", nargs=-1, type=click.Choice([COARSE, FITTED, CHECK]))
-@out_option("figures, report.html and cases; default: results/paper, or paper-fitted")
-@set_option
-@plots_option
+@options("reproduce")
 def reproduce(
     variants: tuple[str, ...],
     out: Path | None,
@@ -316,7 +272,7 @@ FIELD, QUICK = "field", "quick"
 
 @click.command()
 @click.argument("names", metavar="[quick] [DIAGRAM... | field [CASE...]]", nargs=-1)
-@out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
+@options("bench")
 def bench(names: tuple[str, ...], out: Path | None) -> None:
     """Measure run time against error, or check the benchmark of the field.
 

@@ -6,7 +6,6 @@ Each table has its file in `tables/`: a key is a field, whose meaning and unit s
 from __future__ import annotations
 
 import copy
-import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -511,6 +510,8 @@ def file_digest(path: Path) -> str:
     Raises:
         InputError: the file cannot be read.
     """
+    import hashlib  # 2 ms, which help and most scenes do not need
+
     try:
         content = path.read_bytes()
     except OSError as error:
