@@ -10,19 +10,12 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import Arm
-from dolfinopt.bench.measure import Cells, Plan, arms_of, in_processes, mpirun, program, timed
+from dolfinopt.bench.measure import Cells, Plan, in_processes, mpirun, program, timed
 from dolfinopt.bench.panel import Diagram, Frame, Rows, Steps
 from dolfinopt.data import tables_of, template_folder
-from dolfinopt.errors import ConvergenceError
 from dolfinopt.mesh.arm_mesh import arm_mesh
-from dolfinopt.optimization.assessment import across, filled
 from dolfinopt.output.run_folder import optimize
-from dolfinopt.parallel import partition_arms
-from dolfinopt.profiling import Profile
-from dolfinopt.responses.constraints import EXCESS, limits_of
-from dolfinopt.responses.evaluation import evaluate
-from dolfinopt.responses.response import objective_of
+from dolfinopt.responses.constraints import EXCESS
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.variants import changed
 
@@ -124,12 +117,10 @@ def problems() -> dict[str, Table]:
     return {name: machines[tables.pop("machine")] | tables for name, tables in given.items()}
 
 
-ROD = "lightest rod"
 DRAWN = "bar", "tube", "truss"  # by hand
 OVER = "objective over the best [-]"
 STARTS = {"half": 0.5, "thin": 0.3, "thick": 0.8}  # initial densities, at most the volume's limit
 ITERATIONS, FEW_ITERATIONS = 500, 3
-STRIDE, HALVINGS = 0.05, 6  # of their sizes, of the height; of the stride
 
 
 def posed(tables: Table, start: str, iterations: int) -> Scene:
@@ -151,58 +142,12 @@ def optimised(name: str, start: str, iterations: int) -> Rows:
     yield name, start, *asked, *reached, seconds, result.stop_code.value
 
 
-def drawn(arm: Arm, kind: str, size: float) -> np.ndarray:
-    """Return the densities (n_cells,) of a straight solid member within an arm's box of cells.
-
-    A "bar" is the arm's section times `size`, from 0 to 1; a "tube" has walls of `size` half
-    heights, in the plane flanges; a "truss" such flanges, and as thick diagonals of 45 degrees.
-    """
-    off = across(arm)
-    away = np.abs(off).max(axis=1)
-    if kind != "truss":
-        return filled(arm, size - away if kind == "bar" else size - (1.0 - away))
-    phase = np.mod(arm.mesh.centroid[:, 0] / arm.scene.arms[arm.places[0]].height, 2.0)
-    diagonal = 1.0 - 2.0 * np.abs(phase - 1.0)
-    flanges = size - (1.0 - np.abs(off[:, 0]))
-    braces = 0.5 * size - np.abs(off[:, 0] - diagonal) / np.sqrt(2.0)
-    return filled(arm, np.maximum(flanges, braces))
-
-
-def drawn_by_hand(name: str, kind: str) -> Rows:
-    """Measure the best straight member of a kind that keeps a problem's limits, all arms alike."""
-    scene = posed(problems()[name], "half", 0)
-    arms, partition = arms_of(scene), partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    sign = -1.0 if objective_of(scene).turned else 1.0
-
-    def judged(size: float) -> tuple[bool, float, float, float]:
-        """Return whether limits are broken, what is minimised, the excess, and the size."""
-        x = {k: drawn(arm, kind, size) for k, arm in arms.items()}
-        if not scene.design.projection:  # grey at the edges, as what is optimised
-            x = {k: arms[k].physical(densities) for k, densities in x.items()}
-        try:
-            result, _ = evaluate(scene, partition, arms, x, Profile(), simulated=False)
-        except ConvergenceError:
-            return True, np.inf, np.inf, size
-        excess = max((limit.excess for limit in limits_of(scene, result)), default=0.0)
-        return excess > EXCESS, sign * result.objective, excess, size
-
-    def best() -> tuple[bool, float, float, float]:
-        result = min(map(judged, np.linspace(STRIDE, 1.0, round(1.0 / STRIDE))))
-        for k in range(1, HALVINGS + 1):
-            near = (result[3] + side * STRIDE / 2**k for side in (-1.0, 1.0))
-            result = min(result, *(judged(size) for size in near if 0.0 < size <= 1.0))
-        return result
-
-    seconds, _, (_, value, excess, size) = timed(best)
-    words = f"{100.0 * size:.1f} % of the height"
-    yield name, kind, 0, 0, 0, sign * value, excess, 0, seconds, words
-
-
 def _starts(plan: Plan) -> Steps:
     count = FEW_ITERATIONS if plan.quick else ITERATIONS
+    by_hand = program("drawn_by_hand").drawn_by_hand
     for kind in DRAWN:
         for name in list(problems())[: 1 if plan.quick else None]:
-            yield f"{name}, {kind} drawn by hand", partial(drawn_by_hand, name, kind)
+            yield f"{name}, {kind} drawn by hand", partial(by_hand, name, kind)
     for start in list(STARTS)[: 1 if plan.quick else None]:
         for name in problems():
             yield f"{name}, {start}", partial(optimised, name, start, count)
