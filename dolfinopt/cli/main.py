@@ -20,17 +20,8 @@ import click
 from dolfinopt.cli.exchange import export, import_robot
 from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.shared import PATH, Start, end_before_start, options, warn
-from dolfinopt.cli.studies import (
-    CHECK,
-    COARSE,
-    FITTED,
-    bench,
-    compare,
-    reproduce,
-    sweep,
-    uncertainty,
-)
+from dolfinopt.cli.shared import OPTIONS, PATH, Start, end_before_start, options, warn
+from dolfinopt.cli.studies import bench, compare, reproduce, sweep, uncertainty
 from dolfinopt.data import template_folder
 from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
@@ -228,25 +219,9 @@ GROUPS = {
 }
 
 
-# Options of older command lines: the words behind the command that have taken their place, in the
-# order in which they stand there.
-OLDER: dict[str, dict[str, tuple[str, ...]]] = {
-    "bench": {"--quick": ("quick",), "--records": ("ur10e={}",)},
-    "compare": {"--only": ("{}",)},
-    "export": {
-        "--urdf": ("robot",),
-        "--state-space": ("state-space", "{}"),
-        "--before": ("{}",),
-        "--at": ("{}",),
-    },
-    "import": {"--trajectory": ("{}",), "--links": ("{}",)},
-    "reproduce": {"--coarse": (COARSE,), "--fitted": (FITTED,), "--check": (CHECK,)},
-}
-
-
 def in_new_words(command: str, words: list[str]) -> list[str]:
     """Return a command line in the words of now, and tell which are older."""
-    older, kept, rest = OLDER.get(command, {}), list[str](), iter(words)
+    older, kept, rest = OPTIONS["older"].get(command, {}), list[str](), iter(words)
     new: dict[str, list[str]] = {option: [] for option in older}
     for word in rest:
         option, stated, value = word.partition("=")

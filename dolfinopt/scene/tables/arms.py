@@ -14,7 +14,6 @@ from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
     NAMES_FILE,
-    ByDimension,
     Extent,
     FileName,
     Inertia,
@@ -24,14 +23,12 @@ from dolfinopt.scene.tables.base import (
     Six,
     Three,
     TwoOrThree,
-    Use,
     shown,
     table_in,
 )
 from dolfinopt.scene.tables.design import Region, check_regions
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
-    OF_PARTS,
     Drive,
     Interface,
     Point,
@@ -155,14 +152,6 @@ def check_arm_name(name: str) -> str:
 
 class Arm(Drive):
     """One flexible arm; a key left out in a scene is taken from the arm before."""
-
-    USES = (
-        Use("wall min_wall max_wall", "hollow"),
-        Use("mass inertia centre", "rigid"),
-        Use("mesh_size cell_shape mesh_scale", "mesh"),
-        *OF_PARTS,
-    )
-    BY_DIMENSION = ByDimension(in_space="centre interfaces", numbers="inertia")
 
     name: Annotated[str, AfterValidator(check_arm_name)]
     length: Extent

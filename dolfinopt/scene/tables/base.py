@@ -98,6 +98,7 @@ def rows(tree: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
 
 
 MEANINGS = tables_of("scene/keys.toml")  # of every table's keys, with the unit, by its class
+USES, DIMENSIONS = MEANINGS.pop("uses"), MEANINGS.pop("dimensions")
 
 
 class Use(NamedTuple):
@@ -106,17 +107,17 @@ class Use(NamedTuple):
     Attributes:
         keys: which, separated by spaces.
         choice: the other one.
-        values: of that, separated by spaces; "": any but none, false and 0.
+        values: of that; none: any but none, false and 0.
     """
 
     keys: str
     choice: str
-    values: str = ""
+    values: Sequence[str]
 
     @property
     def words(self) -> str:
         """Return e.g. 'used only with path = "arc"'."""
-        values = " or ".join(map(shown, self.values.split()))
+        values = " or ".join(map(shown, self.values))
         return f"used only with {self.choice}" + f" = {values}" * bool(values)
 
 
@@ -140,7 +141,7 @@ class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
 
     USES: ClassVar[tuple[Use, ...]] = ()
-    BY_DIMENSION: ClassVar[ByDimension] = ByDimension()
+    BY_DIMENSION: ClassVar[ByDimension]
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -149,7 +150,13 @@ class Table(BaseModel):
             cls.model_fields[key].description = meaning
         for key in [key for key in cls.model_fields if key not in cls.__annotations__]:
             cls.model_fields[key] = cls.model_fields.pop(key)
-        for use in cls.USES:
+        uses = [
+            Use(keys, choice, values)
+            for keys, (choice, *values) in USES.get(cls.__name__, {}).items()
+        ]
+        cls.USES = (*cls.USES, *uses)
+        cls.BY_DIMENSION = ByDimension(**DIMENSIONS.get(cls.__name__, {}))
+        for use in uses:
             for key in use.keys.split():
                 field = cls.model_fields[key]
                 meaning, _, unit = str(field.description).rpartition(" [")
@@ -232,7 +239,7 @@ class Table(BaseModel):
     def _check_uses(self) -> Self:
         for use in self.USES:
             choice = getattr(self, use.choice)
-            if choice in use.values.split() if use.values else choice:
+            if choice in use.values if use.values else choice:
                 continue
             reason = f"with {use.choice} = {shown(choice)}: it is {use.words}"
             if choice is None:

@@ -17,7 +17,6 @@ from dolfinopt.scene.tables.base import (
     Table,
     Three,
     TwoOrThree,
-    Use,
 )
 from dolfinopt.scene.tables.joints import (
     Components,
@@ -51,14 +50,6 @@ IN_SPACE: dict[str, tuple[Names, Names]] = {
 
 class Closures(Table):
     """A joint between an arm's interface and another one or the ground that closes a loop."""
-
-    USES = (
-        Use("length stiffness damping", "kind", "rod"),
-        Use("cross_axis", "kind", "universal"),
-        Use("axis", "kind", "pin slider universal"),
-        Use("rpy", "kind", "ball pin slider universal"),
-        Use("damping", "stiffness"),
-    )
 
     name: Annotated[str, AfterValidator(check_joint_name)]
     kind: Kind

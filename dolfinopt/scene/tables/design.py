@@ -15,7 +15,6 @@ from dolfinopt.scene.tables.base import (
     Position,
     Refusal,
     Table,
-    Use,
 )
 
 if TYPE_CHECKING:
@@ -31,12 +30,6 @@ MEMBER_CELLS = 3  # in the width of the thinnest member: with fewer one cell mor
 
 class Design(Table):
     """Design variables x of all cells, their limits and their filter."""
-
-    USES = (
-        Use("sharpness continuation", "projection"),
-        Use("erosion minimum_member minimum_gap", "projection", "robust robust-eroded"),
-        Use("shared_volume", "volume_fraction"),
-    )
 
     volume_fraction: float | None = Field(default=0.5, ge=1e-6, le=1)
     shared_volume: bool = False

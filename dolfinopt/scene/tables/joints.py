@@ -18,7 +18,6 @@ from dolfinopt.scene.tables.base import (
     Stiffness,
     Table,
     Three,
-    Use,
     shown,
 )
 
@@ -216,8 +215,6 @@ def in_frame(arm: Arm, point: Point) -> Point:
 # -- gear, motor, bearing and friction: keys that [[arms]] and [[joints]] share -------------------
 
 OUT_OF_PLANE = {2: "along z", 3: "about x", 4: "about y"}
-# What a joint has with another part alone.
-OF_PARTS = (Use("gear_damping", "gear_stiffness"), Use("friction_speed", "friction"))
 
 
 def _zero_for_inf(values: Any) -> Any:

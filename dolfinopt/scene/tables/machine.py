@@ -10,7 +10,6 @@ from pydantic import AfterValidator, Field
 from dolfinopt.scene.tables.arms import Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import (
     Angle,
-    ByDimension,
     Component,
     DriveForce,
     Duration,
@@ -23,14 +22,10 @@ from dolfinopt.scene.tables.base import (
     Table,
     Three,
     TwoOrThree,
-    Use,
     refuse_count,
     shown,
 )
 from dolfinopt.scene.tables.joints import (
-    DRIVE_KEYS,
-    OF_BEARINGS,
-    OF_PARTS,
     Drive,
     check_direction,
     check_site,
@@ -44,9 +39,6 @@ if TYPE_CHECKING:
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 Direction = Annotated[Three[Component], AfterValidator(check_direction)]
-# What fixed joints do not have.
-OF_MOVING = ("axis", "passive", "position_limits", "velocity_limit", "effort_limit",
-             *(key for key in DRIVE_KEYS if key not in OF_BEARINGS))  # fmt: skip
 GROUND = "ground"
 PATHS = ("joints", "points", "line")  # of machines in space
 
@@ -60,8 +52,6 @@ def check_joint_name(name: str) -> str:
 
 class Joint(Drive):
     """A joint between the ground or an arm's outboard interface and the arm that it holds."""
-
-    USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"), *OF_PARTS)
 
     name: Annotated[str, AfterValidator(check_joint_name)]
     type: JointType
@@ -213,8 +203,6 @@ LEAD_SHARE = 0.05  # of the motion's duration: pre-actuation fades within millis
 class FeedForward(Table):
     """Corrections of joints that keep the tip of the flexible machine on the rigid one's path."""
 
-    USES = (Use("joints spacing lead", "kind", "tip"),)
-
     kind: Literal["none", "tip"] = "none"
     joints: tuple[str, ...] | None = None
     spacing: Duration | None = None
@@ -266,7 +254,6 @@ class Damping(Table):
 class Payload(Table):
     """What the end-effector carries."""
 
-    BY_DIMENSION = ByDimension(in_space="offset arm", numbers="inertia")
     mass: Inertia
     inertia: Inertia | Tensor = 0.0
     offset: Three[Position] = (0.0, 0.0, 0.0)
@@ -301,7 +288,6 @@ FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 class Force(Table):
     """A force and a moment on an interface of an arm, constant or from a table over time."""
 
-    BY_DIMENSION = ByDimension(numbers="moment", vectors="force")
     name: Annotated[str, AfterValidator(check_joint_name)] | None = None
     arm: str
     force: Vector | None = None

@@ -9,7 +9,6 @@ from pydantic import Field
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import (
     Angle,
-    ByDimension,
     Duration,
     FileName,
     Frequency,
@@ -21,7 +20,6 @@ from dolfinopt.scene.tables.base import (
     Table,
     Three,
     TwoOrThree,
-    Use,
     refuse_count,
     shown,
 )
@@ -47,23 +45,6 @@ PROFILES = ("trapezoidal", "s-curve")  # laws that are shaped by the limits
 
 class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
-
-    BY_DIMENSION = ByDimension(
-        in_plane="base cart_follow cart_mass joint_height elbow",
-        in_space="rpy",
-        vectors="gravity start end",
-    )
-    USES = (
-        Use("radius flattening", "path", "arc"),
-        Use("start end rpy", "path", "line"),
-        Use("initial_joints", "path", "line points joints rotation"),
-        Use("file table_ends", "path", "points joints"),
-        Use("speed", "path", "rotation"),
-        Use("cart_follow max_speed max_acceleration max_jerk", "path", "arc line points"),
-        Use("cart_follow cart_mass", "base", "cart"),
-        Use("acceleration_share", "law", "trapezoidal s-curve"),
-        Use("max_jerk", "law", "quintic septic s-curve"),
-    )
 
     path: PathKind
     radius: Length = 1.0
@@ -298,8 +279,6 @@ Coordinates = Annotated[int, Field(ge=1)] | ReductionError | Literal["auto"]
 
 class Reduction(Table):
     """Model reduction of every arm."""
-
-    USES = (Use("frequencies", "method", "krylov balanced"),)
 
     method: ReductionMethod = "craig-bampton"
     coordinates: Coordinates = 4

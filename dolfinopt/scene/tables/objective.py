@@ -10,7 +10,6 @@ from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
     Angle,
-    ByDimension,
     Extent,
     Instant,
     Refusal,
@@ -62,8 +61,6 @@ Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 
 class Objective(Table):
     """What is minimised."""
-
-    BY_DIMENSION = ByDimension(in_plane="elbow_angle")
 
     kind: ObjectiveKind = "esl"
     direction: Direction | None = None
