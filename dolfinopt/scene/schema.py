@@ -20,11 +20,11 @@ from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, table_in
-from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
 from dolfinopt.scene.tables.joints import place_of
 from dolfinopt.scene.tables.machine import (
     LEAD_SHARE,
+    Closures,
     Control,
     Damping,
     FeedForward,
