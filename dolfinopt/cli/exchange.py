@@ -19,6 +19,7 @@ from dolfinopt.cli.shared import (
     start,
     warn,
 )
+from dolfinopt.data import filled
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import ending_at_once
 from dolfinopt.output.folders import check_new, write_new
@@ -90,18 +91,7 @@ def _write_scene(
     else:
         check_new((folder / item for item in new), kept)
     write_new(folder, new, replaced)
-    click.echo(
-        f"{path}: {len(scene.bodies)} arms, {joints} joints that move, "
-        f"{scene.duration:g} s of motion"
-    )
-    for body in scene.bodies:
-        if body.size is not None:
-            sides = " x ".join(f"{item:.3g}" for item in (body.length, *body.size))
-            box = "a box to edit" if body.measured else "a box of guessed height and thickness"
-            what = box if body.mesh is None else f"its shape, {len(body.mesh.cells)} cells"
-            click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}; {scene.masses(body)}")
-            if body.mesh is not None and body.mesh.done:
-                click.echo(f"{scene.arms[body.link]}: {'; '.join(body.mesh.done)}")
+    click.echo(filled("imported.txt.jinja", {}, path=path, scene=scene, joints=joints), nl=False)
     try:
         load_scene(path)
     except InputError as error:

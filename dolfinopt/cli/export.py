@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from scipy.io import savemat
 
 from dolfinopt.arms.arm import Arm, fixed_body
 from dolfinopt.cli.shared import claim, prepare, scene_of, tell, warn
+from dolfinopt.data import filled
 from dolfinopt.disk import working_in, write_arrays, write_atomically, write_bytes
 from dolfinopt.dynamics.build import check_instant
 from dolfinopt.dynamics.state_space import StateSpace
@@ -108,17 +110,9 @@ def _write_state_space(folder: Path, model: StateSpace) -> None:
     cells = {k: x.astype(object) if x.dtype.kind == "U" else x for k, x in arrays.items()}
     write_atomically(mat, lambda stream: savemat(stream, cells, oned_as="column"))
     write_arrays(npz, arrays)
-    kind = "with its control" if model.closed else "drives free"
-    click.echo(
-        f"{kind}, at {model.time:g} s: {len(model.states)} states, {len(model.inputs)} inputs, "
-        f"{len(model.outputs)} outputs; in {npz}, {mat.name}"
-    )
-    click.echo(f"  {_accuracy(model.accurate_below)}")
     poles = [pole for pole in model.poles if pole.imag >= 0.0]
-    for pole in poles[:5]:
-        size = abs(pole)
-        damping = -pole.real / size if size > 0.0 else 0.0
-        click.echo(f"  pole {pole:.5g} 1/s: {size / (2.0 * np.pi):.4g} Hz, damping {damping:.3g}")
+    shown = {"model": model, "poles": poles, "npz": npz, "mat": mat, "tau": tau, "inf": inf}
+    click.echo(filled("state_space.txt.jinja", {}, **shown), nl=False)
     worst = max(poles, key=lambda pole: float(pole.real))
     if model.closed and worst.real > 0.0:
         warn(
@@ -127,13 +121,6 @@ def _write_state_space(folder: Path, model: StateSpace) -> None:
                 "1/s; see whether it stays where the machine rests, at 0 or motion.horizon"
             ]
         )
-
-
-def _accuracy(frequency: float) -> str:
-    """Return how far the poles can be trusted, against twice as many coordinates, Hz."""
-    if frequency == float("inf"):
-        return "all poles hold 1 %"
-    return f"poles below {frequency:.4g} Hz hold 1 %, those above need more coordinates (--below)"
 
 
 def _why(scene: Scene, index: int) -> str:
