@@ -25,6 +25,7 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import brentq, minimize
 
+from dolfinopt.data import filled
 from dolfinopt.disk import make_folder, write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.hollow import KINDS, Section, member
@@ -51,12 +52,6 @@ NAME = "sections"  # of the study's files, and of the folder of the members' mes
 DESIGN, LIGHTEST, SAME = "design", "lightest", "same mass"
 BAR_CELLS = (4, 8)  # of a bar in place of an arm from a file: over its smaller side, at most
 LEAST, MOST = 0.01, 0.95  # shares: thinner walls are foil, thicker ones leave a slit
-VARIED = {
-    2: "In plane stress all parts are as thick as the arm, so that tubes and I sections are none; "
-    "the bar's height is what varies.",
-    3: "Tubes and the I have the outer sides of the arm's envelope, their walls are what varies (a "
-    f"share of {LEAST:g} to {MOST:g} of the largest); walls may buckle, which is not judged.",
-}
 STEPS = 20  # sets of power laws at most
 STEP = 0.03  # relative change of a share from which the exponents are told
 MOVE = 1.0  # largest change of ln s by one set of power laws, halved where they do not hold
@@ -408,7 +403,6 @@ def report(frame: pd.DataFrame, scene: Scene) -> Report:
     columns = ["section", "made", "sizes [mm]", "mass [kg]", objective, COMPLIANCE, DEVIATION,
                "settling [mm]", "stress [MPa]", "grayness [-]"]  # fmt: skip
     limits = pd.DataFrame([_limit_cells(outcome) for outcome in frame["outcome"]])
-    text = " ".join([verdict(scene, frame), *_notes(scene, frame)])
     shown = frame[frame["failure"] == ""]
     if (light := shown["made"] == LIGHTEST).any():
         shown = shown[light | (shown["section"] == DESIGN)]
@@ -417,66 +411,43 @@ def report(frame: pd.DataFrame, scene: Scene) -> Report:
         for kind, mass, outcome in zip(shown["section"], shown["mass [kg]"], shown["outcome"])
     ]
     title = "Deviation with straight members and with the design"
-    table = Table("", text, with_failures(frame, known[columns].join(limits)))
+    table = Table("", verdict(scene, frame), with_failures(frame, known[columns].join(limits)))
     return [table], [LineFigure("deviation", title, tuple(deviation_panels(named)))]
 
 
 def verdict(scene: Scene, frame: pd.DataFrame) -> str:
-    """Return the sentence that says who wins.
+    """Return the sentence that says who wins, and what one has to know to read the table.
 
     By mass where the scene limits what members do, the lightest that hold against the design;
     otherwise by the objective, with the same mass.
     """
-    design, others = frame.iloc[0], frame.iloc[1:]
-    if not limited(design["outcome"]):
-        return _by_objective(scene, design, others[others["failure"] == ""])
-    limits = _limits(design["outcome"])
+    design, *others = frame.to_dict("records")
+    is_limited, limits = bool(limited(design["outcome"])), _limits(design["outcome"])
+    able = [row for row in others if not row["failure"]]
+    if is_limited:
+        able = [row for row in able if row["made"] == LIGHTEST and _holds(row["outcome"])]
     over = {name: _excess(limit) for name, limit in limits.items() if not limit["met"]}
-    missed = ", ".join(f"{name} {100.0 * x:.2g} % over its limit" for name, x in over.items())
-    mass = design["mass [kg]"]
-    weight = f"{mass:.4g} kg" + f" ({missed})" * bool(over)
-    broken = max(over.values(), default=0.0) > SLIGHT
-    able = others[(others["made"] == LIGHTEST) & others["outcome"].map(_holds)]
-    if able.empty:
-        return (
-            "No straight member within the arms' envelope holds the limits, the design weighs "
-            f"{weight}: {'nobody' if broken else 'the design'} wins."
-        )
-    kind, least = able.loc[able["mass [kg]"].idxmin(), ["section", "mass [kg]"]]
-    return (
-        f"The lightest straight {kind} that holds the limits weighs {least:.4g} kg, the design "
-        f"{weight}: the {kind if broken or least < mass else DESIGN} wins."
+    kinds = {row["section"] for row in others if row["made"] == SAME}
+    text = filled(
+        "sections.txt.jinja",
+        {},
+        limited=is_limited,
+        design=design,
+        best=min(
+            able,
+            key=lambda row: row["mass [kg]"] if is_limited else row["outcome"].objective,
+            default=None,
+        ),
+        over=over,
+        broken=max(over.values(), default=0.0) > SLIGHT,
+        response=scene.objective.response,
+        dimension=scene.dimension,
+        least=LEAST,
+        most=MOST,
+        sizes=len({owner for owner in scene.owners if owner is not None}),
+        missing=[kind for kind in KINDS[scene.dimension] if kind not in kinds],
     )
-
-
-def _by_objective(scene: Scene, design: pd.Series, able: pd.DataFrame) -> str:
-    """Return the sentence where nothing but material is limited."""
-    if able.empty:
-        return "No straight member within the arms' envelope has the design's mass."
-    outcomes = [design["outcome"], *able["outcome"]]
-    ours, *theirs = (outcome.objective for outcome in outcomes)
-    least = min(theirs)
-    kind = able["section"].iloc[theirs.index(least)]
-    name, unit = scene.objective.response.label, scene.objective.response.unit
-    return (
-        f"With the design's mass of {design['mass [kg]']:.4g} kg the best straight member, a "
-        f"{kind}, has an objective ({name}) of {least:.4g} {unit}, the design {ours:.4g} {unit}: "
-        f"the {kind if least < ours else DESIGN} wins."
-    )
-
-
-def _notes(scene: Scene, frame: pd.DataFrame) -> list[str]:
-    """Return what one has to know to read the table."""
-    notes = [
-        "Members are straight from joint to joint, uniform, without flanges or bosses.",
-        VARIED[scene.dimension],
-    ]
-    if len({owner for owner in scene.owners if owner is not None}) > 1:
-        notes.append("Every arm has its own size.")
-    kinds = {*frame.loc[frame["made"] == SAME, "section"]}
-    if missing := [kind for kind in KINDS[scene.dimension] if kind not in kinds]:
-        notes.append(f"No {' or '.join(missing)} in the envelope has the design's mass.")
-    return notes
+    return " ".join(text.split())
 
 
 def _holds(outcome: Outcome) -> bool:
