@@ -179,8 +179,10 @@ def test_commands_in_the_text_exist(page):
 
 
 def test_messages_of_troubleshooting_are_those_of_the_program():
-    """What the page quotes between ellipses stands in the code, word for word."""
-    told = "\n".join(text for path in (ROOT / "dolfinopt").rglob("*.py") for text in strings(path))
+    """What the page quotes between ellipses stands in code or templates, word for word."""
+    package = ROOT / "dolfinopt"
+    told = "\n".join(text for path in package.rglob("*.py") for text in strings(path))
+    told += "\n".join(path.read_text(encoding="utf-8") for path in package.rglob("*.jinja"))
     page = (PAGES / "howto" / "troubleshooting.md").read_text(encoding="utf-8")
     quoted = re.findall(r"^\| `([^`]+)` \|", page, flags=re.MULTILINE)
     assert len(quoted) > 20

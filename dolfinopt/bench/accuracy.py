@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, partial
-from itertools import pairwise
 from typing import get_args
 
 import numpy as np
 from mpi4py import MPI
-from scipy.integrate import solve_ivp
 from scipy.special import ndtr
 
 from dolfinopt.arms.arm import Arm, chain_of
-from dolfinopt.bench.measure import Arms, Cells, Densities, Plan, arms_of, timed
+from dolfinopt.bench.measure import Arms, Cells, Densities, Plan, arms_of, program, timed
 from dolfinopt.bench.panel import Diagram, Row, Rows, Steps
 from dolfinopt.dynamics import radau
 from dolfinopt.dynamics.build import build_system
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.dynamics.machine_system import MachineSystem
-from dolfinopt.dynamics.system import System, relative_error
+from dolfinopt.dynamics.system import relative_error
 from dolfinopt.dynamics.time_grid import even_steps
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.output.run_folder import optimize
@@ -111,54 +109,11 @@ def radau_motion(stages: int, tolerance: float, to: Reference) -> np.ndarray:
     return radau.integrate(to.problem, tolerance, stages, Profile()).sample(to.t)
 
 
-def accelerations(problem: System, t: float, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-    """Return qdd (N,) from M(q, t) qdd = -residual(q, qd, 0), t in s; q and qd are (N,)."""
-    now, state = problem.at(np.array([t])), (q[None], qd[None], np.zeros((1, len(q))))
-    mass = now.linearise(*state).dense()[0, :, 2 * len(q) :]
-    return np.linalg.solve(mass, -now.residual(*state)[0])
-
-
-def jacobian(problem: System, t: float, y: np.ndarray) -> np.ndarray:
-    """Return the derivative (2N, 2N) of [qd, qdd] by y = [q, qd], exact."""
-    size = len(y) // 2
-    q, qd = y[:size], y[size:]
-    qdd = accelerations(problem, t, q, qd)
-    tangent = problem.at(np.array([t])).linearise(q[None], qd[None], qdd[None]).dense()[0]
-    lower = np.linalg.solve(tangent[:, 2 * size :], -tangent[:, : 2 * size])
-    return np.vstack([np.eye(size, 2 * size, size), lower])
-
-
-def scipy_motion(method: str, tolerance: float, to: Reference) -> np.ndarray:
-    """Return q (n, N) by SciPy's `solve_ivp`, between breakpoints; ConvergenceError if it fails.
-
-    In the arms' vibrations, where one absolute tolerance suits all: the relative one times the
-    largest value of q, and of its rate.
-    """
-    modes, t = to.problem.preconditioner(), to.t
-    problem, z = modes.system, modes.to_modes(to.q)
-    start = problem.initial_state()[0][0]
-    size = len(start)
-    y, q = np.concatenate([start, np.zeros(size)]), np.empty((len(t), size))
-    largest = [float(np.abs(each).max()) for each in (z, np.gradient(z, t, axis=0))]
-    options = {"rtol": tolerance, "atol": tolerance * np.repeat(largest, size)}
-    options |= {"jac": partial(jacobian, problem), "dense_output": True}
-
-    def rate(now: float, y: np.ndarray) -> np.ndarray:
-        return np.concatenate([y[size:], accelerations(problem, now, y[:size], y[size:])])
-
-    for ends in pairwise(problem.breakpoints):
-        done = solve_ivp(rate, ends, y, method, **options)
-        if not done.success:
-            raise ConvergenceError(f"solve_ivp: {done.message}")
-        here = (t >= ends[0]) & (t <= ends[1])
-        q[here], y = done.sol(t[here])[:size].T, done.y[:, -1]
-    return modes.from_modes(q)
-
-
+SCIPY = program("solve_ivp").scipy_motion
 # By name: what returns q (n, N) of a tolerance and the reference.
 METHODS: dict[str, Callable[[float, Reference], np.ndarray]] = {
     **{f"Radau, {stages} stages": partial(radau_motion, stages) for stages in (2, 3, 4, 5)},
-    **{f"SciPy {name}": partial(scipy_motion, name) for name in ("Radau", "BDF", "LSODA")},
+    **{f"SciPy {name}": partial(SCIPY, name) for name in ("Radau", "BDF", "LSODA")},
 }
 
 

@@ -8,23 +8,21 @@ is not this one needs the words, the scene's figures and the reference tables on
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Callable, Sequence
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
 from mpi4py import MPI
 from pydantic import ConfigDict, ValidationError
 
-from dolfinopt.data import benchmark_folder
+from dolfinopt.bench.measure import load_program
+from dolfinopt.data import benchmark_folder, tomllib
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.model import Model, SimulationResult
 from dolfinopt.multibody.kinematics import Posed
-from dolfinopt.scene.load import tomllib
 from dolfinopt.scene.tables.base import Table, input_error, problem
 
 
@@ -199,15 +197,6 @@ def read_table(name: str) -> dict[str, np.ndarray]:
         head, *rows = csv.reader(lines)
     names = [column.split("[")[0].strip() for column in head]
     return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
-
-
-def load_program(file: Path) -> Any:
-    """Return the module of a case's program."""
-    spec: Any = spec_from_file_location(f"benchmark_{file.stem}", file)
-    module = module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look it up
-    spec.loader.exec_module(module)
-    return module
 
 
 class Checked(NamedTuple):

@@ -3,35 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from functools import cache, partial
-from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-import ufl
-from dolfinx import fem
-from dolfinx.fem import petsc
 from mpi4py import MPI
-from petsc4py import PETSc
 
-from dolfinopt.arms.arm import Arm
-from dolfinopt.bench.measure import Cells, Plan, arms_of, in_processes, mpirun, timed
+from dolfinopt.bench.measure import Cells, Plan, in_processes, mpirun, program, timed
 from dolfinopt.bench.panel import Diagram, Frame, Rows, Steps
-from dolfinopt.data import template_folder
-from dolfinopt.errors import ConvergenceError
-from dolfinopt.fem.interior import with_rigid_motions
-from dolfinopt.mesh import compat
-from dolfinopt.mesh.arm_mesh import ArmMesh, arm_mesh
-from dolfinopt.optimization.assessment import across, filled
+from dolfinopt.data import tables_of, template_folder
+from dolfinopt.mesh.arm_mesh import arm_mesh
 from dolfinopt.output.run_folder import optimize
-from dolfinopt.parallel import partition_arms
-from dolfinopt.profiling import Profile
-from dolfinopt.responses.constraints import EXCESS, limits_of
-from dolfinopt.responses.evaluation import evaluate
-from dolfinopt.responses.response import objective_of
-from dolfinopt.scene.load import Scene, scene_from_dict, tomllib
+from dolfinopt.responses.constraints import EXCESS
+from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.variants import changed
 
 # -- two arms against elements, on ranks, beside plain DOLFINx --------------------------------
@@ -69,11 +54,11 @@ def with_cells(scene: Scene, cells: Cells, *settings: str) -> Scene:
     return changed(scene, f"arms.cells={list(cells)}", *settings)
 
 
-def plain_iteration(scene: Scene, cells: Cells) -> Iteration:
-    """Return plain DOLFINx's iteration of the scene's first arm."""
+def plain_iteration(scene: Scene, cells: Cells) -> Any:
+    """Return plain DOLFINx's iteration of the scene's first arm, see the program."""
     arm, solid = with_cells(scene, cells).arms[0], scene.material_of(0)
     mesh, modulus = arm_mesh(MPI.COMM_SELF, arm), solid.modulus * arm.thickness
-    return plain_statics(mesh, modulus, solid.ratio, arm.height)
+    return program("plain_dolfinx").plain_statics(mesh, modulus, solid.ratio, arm.height)
 
 
 def _iterations(plan: Plan) -> Steps:
@@ -117,78 +102,6 @@ ITERATION = Diagram(
 )
 
 
-# -- static iterations of other programs ---------------------------------------------------
-
-PENALTY, FLOOR = 3.0, 1e-6  # of the interpolation
-
-# Densities (n_cells,) -> compliance under a force across the end, N m, and its gradient.
-Iteration = Callable[[np.ndarray], tuple[float, np.ndarray]]
-
-
-def plain_statics(
-    arm: ArmMesh, modulus: float, nu: float, area: float, tolerance: float = 1e-7
-) -> Iteration:
-    """Return the compliance of a cantilever as DOLFINx's own demos would find it (collective).
-
-    Clamped at its inboard facets, 1 N over its end. Linear elements, no filter. In the plane MUMPS'
-    Cholesky factor, the modulus times the thickness, and the area the height; in space conjugate
-    gradients with GAMG from 0 to the tolerance, and energies of cells in place of the gradient.
-    """
-    mesh, d, in_plane = arm.mesh, arm.dim, arm.dim == 2
-    space = compat.lagrange_space(mesh, 1, components=d)
-    cellwise = getattr(fem, "functionspace", fem.FunctionSpace)(mesh, ("DG", 0))
-    density, displacement = fem.Function(cellwise), fem.Function(space)
-    a, b, w = ufl.TrialFunction(space), ufl.TestFunction(space), ufl.TestFunction(cellwise)
-    # In the plane the law stands in the form, as one writes it; that doubles what an iteration
-    # takes: quadrature allows for x**3.0 as if x varied in a cell. In space x is E itself.
-    young = modulus * (FLOOR + (1.0 - FLOOR) * density**PENALTY) if in_plane else density
-    slope = -modulus * PENALTY * (1.0 - FLOOR) * density ** (PENALTY - 1.0) if in_plane else 1.0
-    shear, rest = 1.0 / (1.0 + nu), 1.0 - nu if in_plane else 1.0 - 2.0 * nu
-
-    def energy(u: Any, v: Any) -> Any:  # of unit stiffness; plane stress in the plane
-        strain, other = ufl.sym(ufl.grad(u)), ufl.sym(ufl.grad(v))
-        stress = shear * strain + shear * nu / rest * ufl.tr(strain) * ufl.Identity(d)
-        return ufl.inner(stress, other)
-
-    end = ufl.gt(ufl.SpatialCoordinate(mesh)[0], (1.0 - 1e-9) * arm.outboard_point[0])
-    stiffness = compat.compile_form(young * energy(a, b) * ufl.dx)
-    gradient = compat.compile_form(slope * energy(displacement, displacement) * w * ufl.dx)
-    dofs = fem.locate_dofs_topological(space, d - 1, arm.inboard_facets)
-    clamp = fem.dirichletbc(np.zeros(d), dofs, space)
-    force = ufl.conditional(end, 1.0 / area, 0.0) * b[1] * ufl.ds
-    load = petsc.assemble_vector(compat.compile_form(force))
-    load.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
-    petsc.set_bc(load, [clamp])
-    solution, K = load.duplicate(), petsc.create_matrix(stiffness)
-    solver = PETSc.KSP().create(arm.comm)
-    solver.setType("preonly" if in_plane else "cg")
-    solver.getPC().setType("cholesky" if in_plane else "gamg")
-    if in_plane:
-        solver.getPC().setFactorSolverType("mumps")
-    solver.setTolerances(rtol=tolerance)
-
-    def iterate(x: np.ndarray) -> tuple[float, np.ndarray]:
-        density.x.array[: len(x)] = x if in_plane else modulus * (FLOOR + x**PENALTY)
-        density.x.scatter_forward()
-        K.zeroEntries()
-        petsc.assemble_matrix(K, stiffness, bcs=[clamp])
-        K.assemble()
-        if in_plane:
-            K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            K.setOption(PETSc.Mat.Option.SPD, True)
-        else:  # tell GAMG what K does not resist
-            owned = K.getLocalSize()[0] // 3
-            with_rigid_motions(K, space.tabulate_dof_coordinates()[:owned])
-        solver.setOperators(K)
-        solver.solve(load, solution)
-        displacement.x.array[: len(solution.array)] = solution.array
-        displacement.x.scatter_forward()
-        slopes = petsc.assemble_vector(gradient).array_r.copy()
-        return float(load.dot(solution)), slopes
-
-    return iterate
-
-
 # -- thirteen small problems from three starts each, beside members drawn by hand ----------------
 
 Table = dict[str, Any]
@@ -197,20 +110,17 @@ Table = dict[str, Any]
 @cache
 def problems() -> dict[str, Table]:
     """Return the tables of every problem's scene, by its name."""
-    with Path(__file__).with_name("optimiser.toml").open("rb") as file:
-        machines = tomllib.load(file)
+    machines = tables_of("bench/optimiser.toml")
     given = machines.pop("problems")
     motion = machines["pick_and_place"]["motion"]
     motion["file"] = str(template_folder() / motion["file"])
     return {name: machines[tables.pop("machine")] | tables for name, tables in given.items()}
 
 
-ROD = "lightest rod"
 DRAWN = "bar", "tube", "truss"  # by hand
 OVER = "objective over the best [-]"
 STARTS = {"half": 0.5, "thin": 0.3, "thick": 0.8}  # initial densities, at most the volume's limit
 ITERATIONS, FEW_ITERATIONS = 500, 3
-STRIDE, HALVINGS = 0.05, 6  # of their sizes, of the height; of the stride
 
 
 def posed(tables: Table, start: str, iterations: int) -> Scene:
@@ -232,58 +142,12 @@ def optimised(name: str, start: str, iterations: int) -> Rows:
     yield name, start, *asked, *reached, seconds, result.stop_code.value
 
 
-def drawn(arm: Arm, kind: str, size: float) -> np.ndarray:
-    """Return the densities (n_cells,) of a straight solid member within an arm's box of cells.
-
-    A "bar" is the arm's section times `size`, from 0 to 1; a "tube" has walls of `size` half
-    heights, in the plane flanges; a "truss" such flanges, and as thick diagonals of 45 degrees.
-    """
-    off = across(arm)
-    away = np.abs(off).max(axis=1)
-    if kind != "truss":
-        return filled(arm, size - away if kind == "bar" else size - (1.0 - away))
-    phase = np.mod(arm.mesh.centroid[:, 0] / arm.scene.arms[arm.places[0]].height, 2.0)
-    diagonal = 1.0 - 2.0 * np.abs(phase - 1.0)
-    flanges = size - (1.0 - np.abs(off[:, 0]))
-    braces = 0.5 * size - np.abs(off[:, 0] - diagonal) / np.sqrt(2.0)
-    return filled(arm, np.maximum(flanges, braces))
-
-
-def drawn_by_hand(name: str, kind: str) -> Rows:
-    """Measure the best straight member of a kind that keeps a problem's limits, all arms alike."""
-    scene = posed(problems()[name], "half", 0)
-    arms, partition = arms_of(scene), partition_arms(MPI.COMM_SELF, scene.cell_counts)
-    sign = -1.0 if objective_of(scene).turned else 1.0
-
-    def judged(size: float) -> tuple[bool, float, float, float]:
-        """Return whether limits are broken, what is minimised, the excess, and the size."""
-        x = {k: drawn(arm, kind, size) for k, arm in arms.items()}
-        if not scene.design.projection:  # grey at the edges, as what is optimised
-            x = {k: arms[k].physical(densities) for k, densities in x.items()}
-        try:
-            result, _ = evaluate(scene, partition, arms, x, Profile(), simulated=False)
-        except ConvergenceError:
-            return True, np.inf, np.inf, size
-        excess = max((limit.excess for limit in limits_of(scene, result)), default=0.0)
-        return excess > EXCESS, sign * result.objective, excess, size
-
-    def best() -> tuple[bool, float, float, float]:
-        result = min(map(judged, np.linspace(STRIDE, 1.0, round(1.0 / STRIDE))))
-        for k in range(1, HALVINGS + 1):
-            near = (result[3] + side * STRIDE / 2**k for side in (-1.0, 1.0))
-            result = min(result, *(judged(size) for size in near if 0.0 < size <= 1.0))
-        return result
-
-    seconds, _, (_, value, excess, size) = timed(best)
-    words = f"{100.0 * size:.1f} % of the height"
-    yield name, kind, 0, 0, 0, sign * value, excess, 0, seconds, words
-
-
 def _starts(plan: Plan) -> Steps:
     count = FEW_ITERATIONS if plan.quick else ITERATIONS
+    by_hand = program("drawn_by_hand").drawn_by_hand
     for kind in DRAWN:
         for name in list(problems())[: 1 if plan.quick else None]:
-            yield f"{name}, {kind} drawn by hand", partial(drawn_by_hand, name, kind)
+            yield f"{name}, {kind} drawn by hand", partial(by_hand, name, kind)
     for start in list(STARTS)[: 1 if plan.quick else None]:
         for name in problems():
             yield f"{name}, {start}", partial(optimised, name, start, count)

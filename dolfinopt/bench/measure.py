@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
@@ -24,6 +25,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, build_arms
+from dolfinopt.data import benchmark_folder
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.parallel import partition_arms
 from dolfinopt.profiling import Profile
@@ -78,6 +80,20 @@ def timed(
 def arms_of(scene: Scene) -> Arms:
     """Return the scene's arms on this rank alone."""
     return build_arms(scene, partition_arms(MPI.COMM_SELF, scene.cell_counts), Profile())
+
+
+def load_program(file: Path) -> Any:
+    """Return the module of a file."""
+    spec: Any = spec_from_file_location(f"benchmark_{file.stem}", file)
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look it up
+    spec.loader.exec_module(module)
+    return module
+
+
+def program(name: str) -> Any:
+    """Return the module of another program beside which this one is measured."""
+    return load_program(benchmark_folder() / "programs" / f"{name}.py")
 
 
 def mpirun() -> str | None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from dolfinopt.bench import accuracy, iterations, solid
 from dolfinopt.bench.measure import Plan
 from dolfinopt.bench.panel import Diagram, Frame, Row, curves, fitted_power, least_x, write
+from dolfinopt.data import benchmark_folder
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.study.tables import Table
@@ -93,9 +94,10 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[li
 
 @cache
 def source() -> str:
-    """Return a digest of this package's Python files, as they are when first asked for."""
+    """Return a digest of all Python files that are measured, as they are when first asked for."""
     digest, folder = hashlib.sha256(), Path(__file__).parents[1]
-    for path in sorted(folder.rglob("*.py")):
+    others = benchmark_folder().glob("programs/*.py")  # reached by a link
+    for path in sorted({*folder.rglob("*.py"), *others}):
         digest.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 

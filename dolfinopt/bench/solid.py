@@ -13,8 +13,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, field_tolerance
-from dolfinopt.bench.iterations import plain_statics
-from dolfinopt.bench.measure import Plan, in_processes, mpirun
+from dolfinopt.bench.measure import Plan, in_processes, mpirun, program
 from dolfinopt.bench.panel import Diagram, Rows, Steps
 from dolfinopt.fem.multigrid import MultigridSolver
 from dolfinopt.mesh.arm_mesh import box_arm
@@ -93,7 +92,8 @@ def plain_link(comm: MPI.Comm, scene: Scene, cells: Cells) -> Found:
     """Return a static iteration in plain DOLFINx: trilinear hexahedra, one load (collective)."""
     arm, solid = box_arm(comm, "link", SIZE, cells), scene.material_of(0)
     tolerance, area = field_tolerance(scene), HEIGHT * THICKNESS
-    plain = plain_statics(arm, solid.modulus, solid.ratio, area, tolerance)
+    given = arm, solid.modulus, solid.ratio, area, tolerance
+    plain = program("plain_dolfinx").plain_statics(*given)
     return nodal_dofs(cells), MultigridSolver.name, [_seconds(comm, plain, box_beam(arm.centroid))]
 
 

@@ -12,48 +12,30 @@ import click
 
 from dolfinopt.cli.shared import (
     PATH,
-    design_option,
     load,
-    out_option,
-    overwrite_option,
+    options,
     scene_argument,
     scene_of,
-    set_option,
     start,
     warn,
 )
+from dolfinopt.data import filled
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import ending_at_once
+from dolfinopt.output.folders import check_new, write_new
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
     from dolfinopt.exchange.urdf.scene import RobotScene
-    from dolfinopt.scene.load import Scene
 
 
 @click.command(name="import")
 @click.argument("robot", type=PATH)
 @click.argument("words", nargs=-1, metavar="TABLE LINK...")
-@click.option(
-    "--tool", metavar="LINK", help="end-effector; default: end of the chosen links' chain"
-)
-@click.option(
-    "--package-path",
-    hidden=True,  # older than ROS_PACKAGE_PATH here
-    multiple=True,
-    type=click.Path(exists=True, file_okay=False),
-)
-@click.option(
-    "--closures",
-    type=PATH,
-    metavar="FILE",
-    help="table (TOML) of closed loops, which URDF cannot state: joints that are passive, and "
-    "[[closures]] with links and points in their frames",
-)
-@click.option("--boxes", is_flag=True, help="solid boxes, whatever the links' geometry")
-@overwrite_option
-@out_option("the scene; default: ROBOT without its ending")
+@options("import")
 def import_robot(
     robot: Path,
     words: tuple[str, ...],
@@ -98,8 +80,6 @@ def _write_scene(
 ) -> None:
     """Write scene, table and record, and say what they are."""
     from dolfinopt.loading import load_scene
-    from dolfinopt.output.folders import check_new, write_new
-    from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
     *_, name = new
     path, kept = folder / name, ", or --overwrite to replace the import; an edited scene is kept"
@@ -111,18 +91,7 @@ def _write_scene(
     else:
         check_new((folder / item for item in new), kept)
     write_new(folder, new, replaced)
-    click.echo(
-        f"{path}: {len(scene.bodies)} arms, {joints} joints that move, "
-        f"{scene.duration:g} s of motion"
-    )
-    for body in scene.bodies:
-        if body.size is not None:
-            sides = " x ".join(f"{item:.3g}" for item in (body.length, *body.size))
-            box = "a box to edit" if body.measured else "a box of guessed height and thickness"
-            what = box if body.mesh is None else f"its shape, {len(body.mesh.cells)} cells"
-            click.echo(f"{scene.arms[body.link]}: solid, {sides} m, {what}; {scene.masses(body)}")
-            if body.mesh is not None and body.mesh.done:
-                click.echo(f"{scene.arms[body.link]}: {'; '.join(body.mesh.done)}")
+    click.echo(filled("imported.txt.jinja", {}, path=path, scene=scene, joints=joints), nl=False)
     try:
         load_scene(path)
     except InputError as error:
@@ -151,17 +120,7 @@ FORMATS = {"bodies": ("design", "set"), "robot": (), "state-space": ("design", "
 @scene_argument
 @click.argument("kind", type=click.Choice(list(FORMATS)), default="bodies", metavar="[WHAT]")
 @click.argument("last", required=False, metavar="[T | BEFORE]")
-@design_option
-@out_option("the files; default: results/SCENE-WHAT, or urdf or state-space in the folder of a run")
-@overwrite_option
-@set_option
-@click.option(
-    "--below",
-    type=click.FloatRange(min=0.0, min_open=True),
-    metavar="HZ",
-    help="of state-space: take as many coordinates as poles below this frequency need to be within "
-    "1 %; default: those of the scene",
-)
+@options("export")
 def export(
     scene: Path,
     kind: str,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from math import inf, tau
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from scipy.io import savemat
 
 from dolfinopt.arms.arm import Arm, fixed_body
 from dolfinopt.cli.shared import claim, prepare, scene_of, tell, warn
+from dolfinopt.data import filled
 from dolfinopt.disk import working_in, write_arrays, write_atomically, write_bytes
 from dolfinopt.dynamics.build import check_instant
 from dolfinopt.dynamics.state_space import StateSpace
@@ -27,7 +28,7 @@ from dolfinopt.exchange.urdf.scene import Origin, read_origin
 from dolfinopt.interrupt import ending_at_once
 from dolfinopt.loading import load_scene
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.output.design import Designed, arms_with_design, gather_views, under_law_of
+from dolfinopt.output.design import arms_with_design, under_law_of
 from dolfinopt.output.folders import PARTS, prepare_folder, remove_stale, stale_parts
 from dolfinopt.parallel import gather_arms, on_root, together
 from dolfinopt.profiling import Profile
@@ -38,7 +39,7 @@ from dolfinopt.scene.load import Scene, pose_scenarios
 from dolfinopt.scene.sid import write_sid, write_sid_npz
 
 if TYPE_CHECKING:
-    from dolfinopt.study.tables import Table
+    pass
 
 KINDS = (".sid", ".sid.npz", ".fem")
 
@@ -109,17 +110,9 @@ def _write_state_space(folder: Path, model: StateSpace) -> None:
     cells = {k: x.astype(object) if x.dtype.kind == "U" else x for k, x in arrays.items()}
     write_atomically(mat, lambda stream: savemat(stream, cells, oned_as="column"))
     write_arrays(npz, arrays)
-    kind = "with its control" if model.closed else "drives free"
-    click.echo(
-        f"{kind}, at {model.time:g} s: {len(model.states)} states, {len(model.inputs)} inputs, "
-        f"{len(model.outputs)} outputs; in {npz}, {mat.name}"
-    )
-    click.echo(f"  {_accuracy(model.accurate_below)}")
     poles = [pole for pole in model.poles if pole.imag >= 0.0]
-    for pole in poles[:5]:
-        size = abs(pole)
-        damping = -pole.real / size if size > 0.0 else 0.0
-        click.echo(f"  pole {pole:.5g} 1/s: {size / (2.0 * np.pi):.4g} Hz, damping {damping:.3g}")
+    shown = {"model": model, "poles": poles, "npz": npz, "mat": mat, "tau": tau, "inf": inf}
+    click.echo(filled("state_space.txt.jinja", {}, **shown), nl=False)
     worst = max(poles, key=lambda pole: float(pole.real))
     if model.closed and worst.real > 0.0:
         warn(
@@ -128,13 +121,6 @@ def _write_state_space(folder: Path, model: StateSpace) -> None:
                 "1/s; see whether it stays where the machine rests, at 0 or motion.horizon"
             ]
         )
-
-
-def _accuracy(frequency: float) -> str:
-    """Return how far the poles can be trusted, against twice as many coordinates, Hz."""
-    if frequency == float("inf"):
-        return "all poles hold 1 %"
-    return f"poles below {frequency:.4g} Hz hold 1 %, those above need more coordinates (--below)"
 
 
 def _why(scene: Scene, index: int) -> str:
@@ -171,16 +157,6 @@ def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
 PAGES = ("before_after.md", "before_after.csv", "before_after.html")
 
 
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """A finished run, and the arms as its design makes them."""
-
-    folder: Path
-    design: Designed
-    # of all arms with a design of their own, reduced; on the root
-    bodies: Mapping[int, ShapeIntegrals]
-
-
 def export_robot(
     world: MPI.Comm, scene: Scene, run: Path, out: Path | None, overwrite: bool, before: Path | None
 ) -> None:
@@ -196,26 +172,21 @@ def export_robot(
     """
     origin = on_root(world, _origin_of, scene, run)
     folder = out or run / "urdf"
-    table = None
-    if before is not None:
-        from dolfinopt.study.before_after import compare_runs  # with pandas: half a second
-
-        table = on_root(world, compare_runs, before, run)
     names = [origin.file.name, *(f"{arm}.stl" for arm in origin.links)]
     on_root(world, _check_robot, origin.file, folder, names)
     claim(world, folder, overwrite, [*names, *PAGES])
-    after = _reduced(world, run, scene)
-    links = _links(world, after)
-    sides = [] if before is None else _sides(world, before, after)
+    pages, figures = ({}, "") if before is None else on_root(world, _pages, before, run, scene)
+    links = _links(world, scene, run)
     with together(world):
         if world.rank == 0:
             with ending_at_once():
                 files, said = _robot_files(scene, origin, folder, links)
-                if table is not None:
-                    files = _pages(table, sides) | files
-                    said.append(table.markdown())
-            _write_robot(folder, files, origin.file.name)
-            click.echo("\n".join(said))
+            prepare_folder(folder)
+            with working_in(folder):
+                remove_stale(folder, [origin.file.name, *PAGES])
+                for name, data in (pages | files).items():
+                    write_bytes(folder / name, data)  # the robot last: the others belong to it
+            click.echo("\n".join([*said, *filter(None, [figures])]))
 
 
 def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
@@ -235,20 +206,21 @@ def _check_robot(file: Path, folder: Path, names: list[str]) -> None:
 _Links = Mapping[str, tuple["ShapeIntegrals", "np.ndarray"]]
 
 
-def _links(world: MPI.Comm, run: _Run) -> _Links:
+def _links(world: MPI.Comm, scene: Scene, run: Path) -> _Links:
     """Return the links of a run: the parts that `dolfinopt part` made, or parts of its design."""
     from dolfinopt.part.folder import SCENE
     from dolfinopt.part.part import make_parts
 
-    folder, scene = run.folder / PARTS, run.design.scene
+    folder = run / PARTS
     if not on_root(world, lambda: (folder / SCENE).is_file() and not stale_parts(folder)):
-        parts = make_parts(scene, run.folder, world=world)
+        bodies, parts = (
+            _reduced(world, scene, run / "design.npz"),
+            make_parts(scene, run, world=world),
+        )
         owners = dict(zip((arm.name for arm in scene.arms), scene.owners, strict=True))
-        return {name: (run.bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
+        return {name: (bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
     machine: Scene = on_root(world, load_scene, folder / SCENE)
-    bodies = _reduced(world, folder, machine, None).bodies
-    if world.rank:
-        return {}
+    bodies = _reduced(world, machine, None)
     files = {item.name: folder / f"{_owner(scene, item.name)}.stl" for item in machine.arms}
     return {
         item.name: (bodies[k], _surface(files[item.name]))
@@ -271,53 +243,30 @@ def _surface(file: Path) -> np.ndarray:
     return 1e-3 * mesh.points[mesh.regular_faces].astype(float)
 
 
-def _reduced(world: MPI.Comm, run: Path, scene: Scene, design: str | None = "design.npz") -> _Run:
-    """Return a finished run's arms, reduced (collective); without a design solid ones."""
-    densities = None if design is None else run / design
-    place = arms_with_design(world, scene, densities, Profile())
+def _reduced(world: MPI.Comm, scene: Scene, design: Path | None) -> dict[int, ShapeIntegrals]:
+    """Return arms with a design, reduced, on the root (collective); None: as they begin."""
+    place = arms_with_design(world, scene, design, Profile())
     with together(world):
         mine = {k: arm.reduce(place.x_phys[k]) for k, arm in place.arms.items()}
-    return _Run(run, place, gather_arms(place.partition, mine))
-
-
-def _write_robot(folder: Path, files: Mapping[str, bytes], robot: str) -> None:
-    """Write all files, the robot last: where it is, the others belong to it (root only)."""
-    prepare_folder(folder)
-    with working_in(folder):
-        remove_stale(folder, [robot, *PAGES])
-        for name, data in files.items():
-            write_bytes(folder / name, data)
+    return gather_arms(place.partition, mine)
 
 
 # -- before and after ------------------------------------------------------------------------
 
 
-def _sides(world: MPI.Comm, before: Path, after: _Run) -> list[Any]:
-    """Return both runs as the page needs them, on the root (collective)."""
-    from dolfinopt.study.before_after import read_side
-
-    sides = []
-    for item in (_reduced(world, before, on_root(world, scene_of, before)), after):
-        views = gather_views(*item.design)
-        with together(world):
-            if world.rank == 0:
-                sides.append(read_side(item.folder, item.design.scene, views, item.bodies))
-    return sides
-
-
-def _pages(table: Table, sides: list[Any]) -> dict[str, bytes]:
-    """Return table and page of both runs by the names of their files (root only)."""
-    from dolfinopt.study.before_after import before_after_page
+def _pages(before: Path, after: Path, scene: Scene) -> tuple[dict[str, bytes], str]:
+    """Return table and page of both runs by the names of their files, and the table (root only)."""
+    from dolfinopt.study.before_after import before_after, before_after_page, read_side
     from dolfinopt.study.sections import sections_of
 
-    before, after = sides
-    sections = sections_of(after.folder)
+    sides = read_side(before, scene_of(before)), read_side(after, scene)
+    table = before_after(*(side.summary for side in sides))
     texts = {
         ".md": table.markdown(),
         ".csv": table.csv(),
-        ".html": before_after_page(before, after, table, sections),
+        ".html": before_after_page(*sides, table, sections_of(after)),
     }
-    return {f"{table.name}{kind}": text.encode() for kind, text in texts.items()}
+    return {f"{table.name}{kind}": text.encode() for kind, text in texts.items()}, texts[".md"]
 
 
 # -- the robot -------------------------------------------------------------------------------

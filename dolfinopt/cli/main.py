@@ -13,32 +13,26 @@ from fnmatch import fnmatchcase
 from io import StringIO
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from dolfinopt.cli.exchange import export, import_robot
 from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
 from dolfinopt.cli.part import part
-from dolfinopt.cli.shared import PATH, Start, end_before_start, warn
-from dolfinopt.cli.studies import (
-    CHECK,
-    COARSE,
-    FITTED,
-    bench,
-    compare,
-    reproduce,
-    sweep,
-    uncertainty,
-)
+from dolfinopt.cli.shared import OPTIONS, PATH, Start, end_before_start, options, warn
+from dolfinopt.cli.studies import bench, compare, reproduce, sweep, uncertainty
 from dolfinopt.data import template_folder
+from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import launched_rank
+from dolfinopt.output.folders import write_new
+from dolfinopt.scene.load import describe_keys
+from dolfinopt.scene.materials import CATALOGUE
+from dolfinopt.scene.messages import KeyInfo
+from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
+from dolfinopt.scene.tables.base import Refusal
 from dolfinopt.version import __version__
-
-if TYPE_CHECKING:
-    from dolfinopt.scene.messages import KeyInfo
-
 
 # -- `dolfinopt init` ----------------------------------------------------------------------------
 
@@ -57,14 +51,11 @@ TEMPLATES = {
 )
 @click.argument("name", default="scene", type=PATH)
 @click.argument("template", type=click.Choice(list(TEMPLATES)), default="two-arm")
-@click.option("--template", "older", hidden=True, type=click.Choice(list(TEMPLATES)))
+@options("init")
 def init(name: Path, template: str, older: str | None) -> None:
     if launched_rank():  # the root does it
         return
     template = older or template
-    from dolfinopt.output.folders import write_new
-    from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
-    from dolfinopt.scene.tables.base import Refusal
 
     path = name if name.suffix == ".toml" else name.with_name(f"{name.name}.toml")
     try:
@@ -94,13 +85,7 @@ def init(name: Path, template: str, older: str | None) -> None:
 
 @click.command()
 @click.argument("pattern", required=False)
-@click.option("--schema", is_flag=True, help="print the JSON schema of scene files, for editors")
-@click.option(
-    "--upgrade",
-    type=PATH,
-    metavar="SCENE",
-    help="rewrite the older words of a scene's file, which is kept as SCENE.old",
-)
+@options("keys")
 def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
     """Explain the keys of a scene.
 
@@ -108,8 +93,6 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
     or match its wildcards ("arms.*"); without PATTERN of all keys. "dolfinopt keys material" lists
     the materials of the catalogue, too, and "dolfinopt keys steel" those whose name contains it.
     """
-    from dolfinopt.scene.load import describe_keys
-    from dolfinopt.scene.schema import scene_schema
 
     if upgrade is not None:
         _upgrade(upgrade)
@@ -134,7 +117,6 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
 
 def _upgrade(scene: Path) -> None:
     """Rewrite a scene's file in the words of now, and say what changed."""
-    from dolfinopt.disk import write_text
     from dolfinopt.scene.upgrade import upgraded
 
     text, told = upgraded(os.fspath(scene))
@@ -161,7 +143,6 @@ def _fits(info: KeyInfo, pattern: str | None) -> bool:
 
 def _materials(pattern: str | None, infos: list[KeyInfo]) -> list[str]:
     """Return a line for every material of the catalogue whose name, or whose key, was asked for."""
-    from dolfinopt.scene.materials import CATALOGUE
 
     if pattern is None:
         return []
@@ -238,25 +219,9 @@ GROUPS = {
 }
 
 
-# Options of older command lines: the words behind the command that have taken their place, in the
-# order in which they stand there.
-OLDER: dict[str, dict[str, tuple[str, ...]]] = {
-    "bench": {"--quick": ("quick",), "--records": ("ur10e={}",)},
-    "compare": {"--only": ("{}",)},
-    "export": {
-        "--urdf": ("robot",),
-        "--state-space": ("state-space", "{}"),
-        "--before": ("{}",),
-        "--at": ("{}",),
-    },
-    "import": {"--trajectory": ("{}",), "--links": ("{}",)},
-    "reproduce": {"--coarse": (COARSE,), "--fitted": (FITTED,), "--check": (CHECK,)},
-}
-
-
 def in_new_words(command: str, words: list[str]) -> list[str]:
     """Return a command line in the words of now, and tell which are older."""
-    older, kept, rest = OLDER.get(command, {}), list[str](), iter(words)
+    older, kept, rest = OPTIONS["older"].get(command, {}), list[str](), iter(words)
     new: dict[str, list[str]] = {option: [] for option in older}
     for word in rest:
         option, stated, value = word.partition("=")
@@ -312,10 +277,7 @@ class _Commands(click.Group):
     no_args_is_help=False,
 )
 @click.version_option(__version__, prog_name="dolfinopt")
-@click.option("--plots/--no-plots", default=True, help="draw pictures, of every command that does")
-@click.option(
-    "--verbose", is_flag=True, help="also tell grayness, contacts and the optimality check"
-)
+@options("commands")
 @click.pass_context
 def commands(ctx: click.Context, plots: bool, verbose: bool) -> None:
     """Stiffen the flexible arms of a moving machine by topology optimisation.

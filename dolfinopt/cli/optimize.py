@@ -12,27 +12,24 @@ import click
 from dolfinopt.cli.shared import (
     PATH,
     claim,
-    design_option,
     draw,
     elapsed,
     in_words,
     load,
-    out_option,
-    overwrite_option,
-    plots_option,
+    options,
     prepare,
     progress,
     scene_argument,
     scene_of,
-    set_option,
     start,
     tell,
     tell_assumed,
-    verbose_option,
 )
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.optimization.measured import PASSING_RATE
+from dolfinopt.output.folders import check_unused, remove_stale, working_alone
 from dolfinopt.progress import with_unit
+from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -40,17 +37,11 @@ if TYPE_CHECKING:
     from dolfinopt.optimization.result import RankResult
     from dolfinopt.output.design import Designed
     from dolfinopt.profiling import Profile
-    from dolfinopt.scene.load import Scene
 
 
 @click.command()
 @scene_argument
-@out_option("the results; default: results/SCENE")
-@click.option("--resume", is_flag=True, help="continue from the checkpoint in DIR")
-@overwrite_option
-@set_option
-@plots_option
-@verbose_option
+@options("optimize")
 def optimize(
     scene: Path,
     out: Path | None,
@@ -68,7 +59,6 @@ def optimize(
     tell_assumed(world, loaded)
     folder = out or Path("results") / scene.stem
     from dolfinopt.output import checkpoint
-    from dolfinopt.output.folders import working_alone
     from dolfinopt.output.run_folder import optimize as run
     from dolfinopt.parallel import on_root
 
@@ -131,12 +121,7 @@ def _conclude(folder: Path, result: RankResult, plots: bool, verbose: bool) -> N
 
 @click.command()
 @scene_argument
-@design_option
-@out_option("the results; default: results/SCENE-simulation")
-@overwrite_option
-@set_option
-@plots_option
-@verbose_option
+@options("simulate")
 def simulate(
     scene: Path,
     design: Path | None,
@@ -154,7 +139,6 @@ def simulate(
     tell_assumed(world, loaded)
     folder = out or Path("results") / f"{scene.stem}-simulation"
     from dolfinopt.output.design import arms_with_design, under_law_of
-    from dolfinopt.output.folders import check_unused, remove_stale, working_alone
     from dolfinopt.output.run_folder import simulated
     from dolfinopt.parallel import on_root
     from dolfinopt.profiling import Profile
@@ -174,25 +158,7 @@ def simulate(
 
 @click.command()
 @scene_argument
-@design_option
-@click.option(
-    "--kind",
-    type=click.Choice(["esl", "exact"]),
-    help="which gradient; default: the scene's objective.gradient",
-)
-@click.option(
-    "--out",
-    type=PATH,
-    metavar="FILE",
-    help="gradient.npz; default: results/SCENE-gradient/gradient.npz",
-)
-@click.option(
-    "--check",
-    is_flag=True,
-    help="compare with finite differences of the simulation",
-)
-@overwrite_option
-@set_option
+@options("gradient")
 def gradient(
     scene: Path,
     design: Path | None,
@@ -270,7 +236,7 @@ def _check_gradient(world: MPI.Comm, place: Designed, profile: Profile) -> None:
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=PATH)
-@click.option("--animation", is_flag=True, help="also draw the moving machine: motion.gif")
+@options("plot")
 def plot(folder: Path, animation: bool) -> None:
     """Redraw the pictures of a finished run in DIR."""
     world = start()

@@ -16,62 +16,27 @@ from dolfinopt.cli.shared import (
     Say,
     claim,
     elapsed,
-    out_option,
-    overwrite_option,
-    plots_option,
+    options,
     progress,
     scene_of,
     start,
     warn,
 )
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.output.folders import prepare_folder
+from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.part.check import Check
     from dolfinopt.part.folder import Saved
     from dolfinopt.part.optimize import Keep, Optimized
     from dolfinopt.part.part import Meshes, Part
-    from dolfinopt.scene.load import Scene
     from dolfinopt.scene.tables.design import Part as Asked
 
 
 @click.command()
 @click.argument("folder", metavar="DIR", type=PATH)
-@out_option("the files; default: DIR/part")
-@click.option(
-    "--tool-radius",
-    type=float,
-    metavar="M",
-    help="smallest radius of concave corners; default: 0.003",
-)
-@click.option(
-    "--tolerance",
-    type=float,
-    metavar="M",
-    help="how far sides may lie from the outline of the densities; default: a cell",
-)
-@click.option("--curves", hidden=True, expose_value=False)  # of splines: no effect
-@click.option("--simplify/--no-simplify", hidden=True, expose_value=False)  # no effect
-@click.option("--round", "rounds", is_flag=True, help="round radii to multiples of 0.5 mm")
-@click.option(
-    "--check/--no-check",
-    default=True,
-    help="simulate the machine with the parts, beside the densities they are made of",
-)
-@click.option(
-    "--optimize/--no-optimize",
-    default=None,
-    help="optimise the parts' free curves: the scene's objective within its limits, on a mesh of "
-    "the parts themselves",
-)
-@click.option("--iterations", type=click.IntRange(1), hidden=True)
-@click.option("--starts", type=click.IntRange(0), hidden=True)
-@click.option(
-    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="override a value of [part]"
-)
-@click.option("--resume", is_flag=True, help="continue an interrupted --optimize")
-@overwrite_option
-@plots_option
+@options("part")
 def part(
     folder: Path,
     out: Path | None,
@@ -228,7 +193,6 @@ class PartsJob:
 
     def write(self, run: Path, target: Path, plots: bool) -> None:
         """Write the files, all or none."""
-        from dolfinopt.output.folders import prepare_folder
         from dolfinopt.part.folder import write_parts
 
         prepare_folder(target)

@@ -7,17 +7,18 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout
 from functools import partial
 from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 from shutil import get_terminal_size
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from dolfinopt.data import tables_of
 from dolfinopt.errors import ConvergenceError, InputError, MissingLibrary, line_of
 from dolfinopt.interrupt import (
     INTERRUPTED,
@@ -34,6 +35,10 @@ from dolfinopt.output.folders import (
     prepare_folder,
     stale_parts,
 )
+from dolfinopt.progress import show_slow_work
+from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
+from dolfinopt.scene.messages import assumed
+from dolfinopt.scene.schema import found_again
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -42,7 +47,6 @@ if TYPE_CHECKING:
     from dolfinopt.optimization.state import HistoryRow
     from dolfinopt.output.design import ArmView
     from dolfinopt.responses.order_selection import OrderSelection
-    from dolfinopt.scene.load import Scene
 
 
 def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
@@ -50,7 +54,6 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
 
     A process alone finds a wrong key before MPI and the solvers are loaded.
     """
-    from dolfinopt.scene.load import read_scene
 
     if launched_rank() is None:
         read_scene(path, overrides)
@@ -113,8 +116,6 @@ def prepare(world: MPI.Comm, folder: Path) -> None:
 
 def scene_of(folder: Path, overrides: tuple[str, ...] = ()) -> Scene:
     """Return the scene of a run, with the coordinates and stiffening that it came to."""
-    from dolfinopt.scene.load import scene_from_dict
-    from dolfinopt.scene.schema import found_again
 
     path = folder / "summary.json"
     try:
@@ -188,7 +189,6 @@ def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
 
 def tell_assumed(world: MPI.Comm, scene: Scene) -> None:
     """Print in one line what the scene does not state and its results depend on."""
-    from dolfinopt.scene.messages import assumed
 
     if world.rank == 0 and (line := assumed(scene)):
         click.echo(line)
@@ -206,7 +206,7 @@ def elapsed() -> float:
     return time.perf_counter() - BEGUN
 
 
-# -- options that several commands have ----------------------------------------------------------
+# -- options ---------------------------------------------------------------------------------
 
 
 class GivenPath(click.Path):
@@ -222,44 +222,51 @@ class GivenPath(click.Path):
 
 
 PATH = GivenPath()
-
-
 scene_argument = click.argument("scene", type=PATH)
+OPTIONS = tables_of("cli/options.toml")
+TYPES = {
+    "path": PATH,
+    "folder": click.Path(exists=True, file_okay=False),
+    "float": float,
+    "int": int,
+    "positive": click.FloatRange(min=0.0, min_open=True),
+}
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 
-set_option = click.option(
-    "--set", "overrides", multiple=True, metavar="KEY=VALUE", help="override a scene value"
-)
+def options(command: str) -> Callable[[Command], Command]:
+    """Give a command the options that options.toml lists for it, in that order."""
+
+    def decorate(function: Command) -> Command:
+        for name, entry in reversed(OPTIONS[command].items()):
+            function = _option(name, **OPTIONS["shared"].get(name, {}) | entry)(function)
+        return function
+
+    return decorate
 
 
-design_option = click.option("--design", type=PATH, help="design.npz; default: the initial design")
+def _option(
+    name: str,
+    option: str = "",
+    type: str = "",
+    choices: Sequence[str] = (),
+    least: int | None = None,
+    usual: bool | None = None,
+    **rules: Any,
+) -> Callable[[Command], Command]:
+    """Return the option of a parameter, see options.toml; `rules` are those of click."""
+    if usual is not None:
+        rules["default"] = partial(_given_before, name, usual)
+    elif "/" in option:
+        rules.setdefault("default", None)  # neither of both
+    kind: Any = click.Choice(choices) if choices else TYPES.get(type)
+    kind = kind if least is None else click.IntRange(least)
+    return click.option(option or f"--{name.replace('_', '-')}", name, type=kind, **rules)
 
 
-def _given_before(name: str, usual: bool) -> Callable[[], bool]:
+def _given_before(name: str, usual: bool) -> bool:
     """Return what an option before the command says, `dolfinopt --no-plots optimize SCENE`."""
-
-    def value() -> bool:
-        before = click.get_current_context().find_root().params
-        return bool(before.get(name, usual))
-
-    return value
-
-
-# They stand before the command, and are read behind it, too.
-plots_option = click.option("--plots/--no-plots", default=_given_before("plots", True), hidden=True)
-
-
-verbose_option = click.option(
-    "--verbose", is_flag=True, default=_given_before("verbose", False), hidden=True
-)
-
-
-overwrite_option = click.option("--overwrite", is_flag=True, help="replace existing results")
-
-
-def out_option(what: str) -> Callable[..., Any]:
-    """Return the --out option of a command that writes a folder."""
-    return click.option("--out", type=PATH, metavar="DIR", help=f"folder for {what}")
+    return bool(click.get_current_context().find_root().params.get(name, usual))
 
 
 # -- when MPI and PETSc are loaded: by a command that has something to compute, not before -------
@@ -303,7 +310,6 @@ class Start:
             from mpi4py import MPI
 
             from dolfinopt.parallel import abort_together
-            from dolfinopt.progress import show_slow_work
 
             self._world = MPI.COMM_WORLD
             show_slow_work()

@@ -12,24 +12,23 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from dolfinopt.cli.shared import (
-    PATH,
     load,
-    out_option,
-    overwrite_option,
-    plots_option,
+    options,
     prepare,
     progress,
     scene_argument,
-    set_option,
     start,
     warn,
 )
+from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.output.folders import read_record
+from dolfinopt.scene.load import Scene
+from dolfinopt.scene.schema import file_digest, with_digests
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-    from dolfinopt.scene.load import Scene
     from dolfinopt.study.cases import Steps
     from dolfinopt.study.tables import Study
 
@@ -39,16 +38,6 @@ COMPARED = {"objectives": "objective", "reductions": "reduction"}
 SECTIONS, MOTIONS = "sections", "motions"
 # Variants of the paper's scene; and to demand its main statements of these, too.
 COARSE, FITTED, CHECK = "coarse", "fitted", "check"
-
-designs_option = click.option(
-    "--design",
-    "designs",
-    multiple=True,
-    metavar="FILE",
-    type=PATH,
-    help="design.npz, any number of times; default: the initial and the optimised design",
-)
-
 
 # What a command asks: name of the study's files, design.npz files, the study's steps in a folder,
 # and what else it asks, but for the values it goes through, which may grow.
@@ -98,16 +87,12 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
             more = f" (and {len(done.failures) - 1} more)" if len(done.failures) > 1 else ""
             raise ConvergenceError(f"{done.failures[0]}{more}")
 
-    decorated: Callable[..., None] = command
-    out = out_option("tables, pictures and cases; default: results/SCENE-study")
-    for option in (plots_option, set_option, overwrite_option, out):
-        decorated = option(decorated)
+    decorated: Callable[..., None] = options("study")(command)
     return decorated
 
 
 def _asked(scene: Scene, designs: Sequence[Path]) -> dict[str, Any]:
     """Return what tells one study from another: scene and designs, files by their content."""
-    from dolfinopt.scene.schema import file_digest, with_digests
 
     known = [file_digest(path) if path.is_file() else str(path) for path in designs]
     return {"scene": with_digests(scene.to_dict()), "designs": known}
@@ -137,14 +122,12 @@ def _write_question(
     folder: Path, name: str, question: Mapping[str, Any], files: Sequence[str]
 ) -> None:
     """Write what a study asked, and its files, as FOLDER/NAME.json."""
-    from dolfinopt.disk import write_text
 
     text = json.dumps({"question": question, "files": sorted(files)}, indent=1)
     write_text(folder / f"{name}.json", text + "\n")
 
 
 def _record(folder: Path, name: str) -> dict[str, Any]:
-    from dolfinopt.output.folders import read_record
 
     return read_record(folder / f"{name}.json")
 
@@ -152,15 +135,7 @@ def _record(folder: Path, name: str) -> dict[str, Any]:
 @click.command()
 @scene_argument
 @click.argument("preset", required=False, type=click.Choice(PRESETS))
-@click.option(
-    "--vary",
-    multiple=True,
-    metavar="KEY=VALUES",
-    help="a scene value and start:stop:count or a,b,c; two make a grid",
-)
-@designs_option
-@click.option("--reoptimize", is_flag=True, help="optimise a design for every value, too")
-@click.option("--keep", is_flag=True, help="keep the folder of every simulation in DIR/cases")
+@options("sweep")
 @study_command
 def sweep(
     scene: Scene,
@@ -185,14 +160,7 @@ def sweep(
 @scene_argument
 @click.argument("what", type=click.Choice([*COMPARED, SECTIONS, MOTIONS]))
 @click.argument("kinds", nargs=-1, metavar="[KIND...]")
-@click.option(
-    "--design",
-    "designs",
-    multiple=True,
-    metavar="FILE",
-    type=PATH,
-    help="design.npz for sections or motions; default: the optimised design",
-)
+@options("compare")
 @study_command
 def compare(
     scene: Scene,
@@ -231,17 +199,7 @@ def compare(
 
 @click.command()
 @scene_argument
-@click.option(
-    "--random",
-    multiple=True,
-    required=True,
-    metavar="KEY=LAW",
-    help="a scene value's distribution: normal:MEAN:DEVIATION, uniform:LOW:HIGH, "
-    "triangular:LOW:MODE:HIGH or lognormal:MEDIAN:SIGMA; several are independent",
-)
-@click.option("--samples", type=int, default=1000, show_default=True, help="number of samples")
-@click.option("--seed", type=int, default=1, show_default=True, help="seed of the random numbers")
-@designs_option
+@options("uncertainty")
 @study_command
 def uncertainty(
     scene: Scene, random: tuple[str, ...], designs: tuple[Path, ...], samples: int, seed: int
@@ -259,9 +217,7 @@ def uncertainty(
 
 @click.command()
 @click.argument("variants", nargs=-1, type=click.Choice([COARSE, FITTED, CHECK]))
-@out_option("figures, report.html and cases; default: results/paper, or paper-fitted")
-@set_option
-@plots_option
+@options("reproduce")
 def reproduce(
     variants: tuple[str, ...],
     out: Path | None,
@@ -316,7 +272,7 @@ FIELD, QUICK = "field", "quick"
 
 @click.command()
 @click.argument("names", metavar="[quick] [DIAGRAM... | field [CASE...]]", nargs=-1)
-@out_option("diagrams and bench.md, or field.csv; default: results/bench, for field none")
+@options("bench")
 def bench(names: tuple[str, ...], out: Path | None) -> None:
     """Measure run time against error, or check the benchmark of the field.
 
@@ -352,7 +308,6 @@ def _check_field(
 ) -> None:
     """Run cases of the benchmark on the root; print each one's values when it is done."""
     from dolfinopt.bench.field import check, chosen_cases, table_of
-    from dolfinopt.disk import write_text
     from dolfinopt.parallel import on_root
 
     result = []

@@ -60,7 +60,7 @@ from dolfinopt.multibody.kinematics import end_effector, end_effector_gradient, 
 from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, add_integrals
 from dolfinopt.profiling import Profile
-from dolfinopt.scene.tables.feed_forward import FeedForward as Asked
+from dolfinopt.scene.tables.machine import FeedForward as Asked
 from dolfinopt.scene.tables.motion import Simulation
 
 # -- corrections -----------------------------------------------------------------------------

@@ -26,37 +26,14 @@ group 19 modalad.cc.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from dolfinopt.data import filled
 from dolfinopt.disk import write_text
-
-_TITLES = {
-    1: "HEADER",
-    2: "FINITE ELEMENT NODE LIST",
-    5: "NODAL X COORDINATES",
-    6: "NODAL Y COORDINATES",
-    7: "NODAL Z COORDINATES",
-    8: "MODE SHAPES",
-    9: "MODAL MASS MATRIX",
-    10: "MODAL STIFFNESS MATRIX",
-    11: "DIAGONAL OF LUMPED MASS MATRIX",
-    12: "GLOBAL INERTIA",
-    13: "MODAL DAMPING MATRIX",
-    14: "INVARIANT 3",
-    15: "INVARIANT 4",
-    16: "INVARIANT 8",
-    17: "INVARIANT 5",
-    18: "INVARIANT 9",
-    19: "MODAL STRESS STIFFENING MATRIX",
-}
-LUMPED = 11
-INVARIANTS = (14, 15, 16, 17, 18)
-STIFFENING = 19  # the group that linear bodies do not have
 
 
 class Invariants(NamedTuple):
@@ -113,43 +90,10 @@ def write_fem(path: Path, element: ModalElement) -> None:
 
 def fem_text(element: ModalElement) -> str:
     """Return the content of the file, numbers with 17 digits."""
-    count, q = len(element.labels), len(element.M)
-    lines = ["** MBDyn MODAL DATA FILE", '** NODE SET "ALL"', "**"]
-
-    def group(number: int, rows: Iterable[str]) -> None:
-        lines.append(f"** RECORD GROUP {number}, {_TITLES[number]}")
-        lines.extend(rows)
-        lines.append("**")
-
-    header = "**   REVISION,  NODE,  NORMAL, ATTACHMENT, CONSTRAINT, REJECTED MODES."
-    group(1, [header, f"      REV0{count:10d}{q:10d}{0:10d}{0:10d}{0:10d}"])
-    labels = element.labels
-    group(2, (" ".join(f"{name:>9}" for name in labels[k : k + 6]) for k in range(0, count, 6)))
-    for axis in range(3):
-        group(5 + axis, _rows(element.points[:, [axis]]))
-    shapes: list[str] = []
-    for k in range(q):
-        shapes += [f"**    NORMAL MODE SHAPE #  {k + 1}", *_rows(element.modes[:, :, k])]
-    group(8, shapes)
-    group(9, _rows(element.M))
-    group(10, _rows(element.K))
-    if element.lumped is not None:
-        group(LUMPED, _rows(element.lumped))
-    inertia = [*_rows(np.array([[element.mass]])), *_rows(element.centre[None])]
-    group(12, [*inertia, *_rows(element.inertia)])
-    group(13, _rows(element.D))
-    if element.invariants is not None:
-        for number, matrix in zip(INVARIANTS, element.invariants, strict=True):
-            # Rows outermost, within them modes j, then k, then columns of what is (3, 3, ...).
-            rows = np.moveaxis(matrix, 1, -1) if number in (16, 18) else matrix
-            group(number, _rows(rows.reshape(-1, rows.shape[-1])))
-    if len(element.loads):
-        matrices = [str(len(element.loads))]
-        for load, matrix in zip(element.loads, element.stiffening, strict=True):
-            matrices += [str(load), *_rows(matrix)]
-        group(STIFFENING, matrices)
-    return "\n".join(lines) + "\n"
+    return filled("modal_element.fem.jinja", {"rows": _rows}, element=element)
 
 
-def _rows(values: np.ndarray) -> list[str]:
-    return [" ".join(f"{v: .16e}" if v != 0.0 else " 0." for v in row) for row in values]
+def _rows(values: np.ndarray) -> str:
+    """Return values (..., n), n on a line."""
+    rows = np.asarray(values).reshape(-1, np.shape(values)[-1]).tolist()
+    return "\n".join(" ".join(f"{v: .16e}" if v != 0.0 else " 0." for v in row) for row in rows)

@@ -41,8 +41,8 @@ from dolfinopt.scene.duration import POINT, SAME_TIME, SPACE_POINT, file_stamp, 
 from dolfinopt.scene.laws import Values
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.arms import Arm
-from dolfinopt.scene.tables.closures import Closures
 from dolfinopt.scene.tables.joints import JointParts, joint_parts, place_of
+from dolfinopt.scene.tables.machine import Closures
 
 if TYPE_CHECKING:
     from dolfinopt.motion.follower import Follower

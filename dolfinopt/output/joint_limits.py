@@ -42,26 +42,25 @@ class JointLimit:
 
 def joint_limits(trajectory: Trajectory) -> Iterator[JointLimit]:
     """Yield how a motion stands to every limit of position, velocity and effort."""
+    motion, forces = trajectory.motion, trajectory.joint_forces
     for k, joint in enumerate(trajectory.scene.movable):
         unit, force = ("m", "N") if joint.type == "prismatic" else ("rad", "N m")
-        if joint.position_limits is not None:
-            (lower, upper), q = joint.position_limits, trajectory.motion.q[:, k]
-            sides = (lower - q, lower), (q - upper, upper)
-            over, limit = max(sides, key=lambda side: float(side[0].max()))
-            worst = int(np.argmax(over))
-            excess = over[worst] / (max(upper - lower, abs(limit)) or 1.0)
-            at = float(trajectory.t[worst])
-            met = bool(excess <= FILE_ROUNDING)
-            yield JointLimit(joint.name, "position", limit, float(q[worst]), at, unit, met)
-        for quantity, bound, values, of in (
-            ("velocity", joint.velocity_limit, trajectory.motion.qd, f"{unit}/s"),
-            ("effort", joint.effort_limit, trajectory.joint_forces, force),
+        for quantity, bounds, values, of in (
+            ("position", joint.position_limits, motion.q, unit),
+            ("velocity", joint.velocity_limit, motion.qd, f"{unit}/s"),
+            ("effort", joint.effort_limit, forces, force),
         ):
-            if bound is not None:
-                size = np.abs(values[:, k])
-                worst = int(np.argmax(size))
-                at, met = (
-                    float(trajectory.t[worst]),
-                    bool(size[worst] <= bound * (1.0 + FILE_ROUNDING)),
-                )
-                yield JointLimit(joint.name, quantity, bound, float(size[worst]), at, of, met)
+            if bounds is None:
+                continue
+            lower, upper = bounds if isinstance(bounds, tuple) else (-bounds, bounds)
+            x = values[:, k]
+            over = np.maximum(lower - x, x - upper)
+            worst = int(np.argmax(over))
+            value = float(x[worst])
+            limit = lower if value - lower < upper - value else upper
+            scale = max(upper - lower, abs(limit)) if quantity == "position" else upper
+            if quantity != "position":  # of the absolute value
+                value, limit = abs(value), upper
+            met = bool(over[worst] <= FILE_ROUNDING * (scale or 1.0))
+            at = float(trajectory.t[worst])
+            yield JointLimit(joint.name, quantity, limit, value, at, of, met)

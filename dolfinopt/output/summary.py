@@ -314,7 +314,9 @@ def _all_warnings(
 def _cost(run: RankResult, wall: float) -> dict[str, Any]:
     """Return seconds by phase, counts, memory and ranks, on the root (collective)."""
     world = run.partition.world
-    seconds = _slowest(world, run.profile.seconds)
+    every = world.allgather(dict(run.profile.seconds))  # of every rank; the slowest counts
+    phases = dict.fromkeys(phase for item in every for phase in item)
+    seconds = {phase: max(item.get(phase, 0.0) for item in every) for phase in phases}
     own = (run.counts or run.profile.counts) if run.partition.is_root else Counts()
     counted = world.gather(own, root=0)
     memory = world.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0)
@@ -581,13 +583,6 @@ def _figures(evaluation: Motion) -> dict[str, float]:
         "max_deviation": evaluation.max_deviation,
         "max_deviation_time": evaluation.max_deviation_time,
     }
-
-
-def _slowest(world: MPI.Comm, seconds: Mapping[str, float]) -> dict[str, float]:
-    """Return the largest time of any rank by phase."""
-    every = world.allgather(dict(seconds))
-    phases = dict.fromkeys(phase for item in every for phase in item)
-    return {phase: max(item.get(phase, 0.0) for item in every) for phase in phases}
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:

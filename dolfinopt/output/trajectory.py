@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.data import tables_of
 from dolfinopt.disk import read_arrays, write_arrays, write_table
 from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import joint_parts
-from dolfinopt.scene.toml import tomllib
 
 # Units of summary.json and history.csv by what they are in.
-UNITS = tomllib.loads(Path(__file__).with_name("units.toml").read_text(encoding="utf-8"))
+UNITS = tables_of("output/units.toml")
 FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit
 
 if TYPE_CHECKING:

@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import pandas as pd
 
-from dolfinopt.data import paper_scene
+from dolfinopt.data import paper_scene, tables_of
 from dolfinopt.disk import write_text
 from dolfinopt.loading import load_scene
 from dolfinopt.output.folders import prepare_folder
 from dolfinopt.parallel import on_root, together
 from dolfinopt.plots.panels import Line, Panel
-from dolfinopt.scene.load import Scene, tomllib
+from dolfinopt.scene.load import Scene
 from dolfinopt.study import studies, variants
 from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
 from dolfinopt.study.studies import QUANTITIES
@@ -313,7 +313,7 @@ def write_report(
 
 
 MANY = 3.0  # from here on "n times" reads better than per cent
-TABLE = tomllib.loads((Path(__file__).parent / "statements.toml").read_text(encoding="utf-8"))
+TABLE = tables_of("paper/statements.toml")
 TOLERANCE = TABLE["tolerance"]
 TEXTS = ("name", "statement", "paper", "found", "criterion", "reason", "demand")
 

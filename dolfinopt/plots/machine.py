@@ -59,6 +59,7 @@ def _legend(figure: Figure, colours: Mapping[str, str], payload: float) -> None:
 # -- a few poses ---------------------------------------------------------------------------------
 
 
+@styled
 def machine_figure(views: Sequence[ArmView], trajectory: Trajectory, title: str) -> Figure:
     """Return the picture of the assembled machine in a few poses on its path, undeformed.
 
@@ -67,23 +68,11 @@ def machine_figure(views: Sequence[ArmView], trajectory: Trajectory, title: str)
         trajectory: how it moves.
         title: above the picture.
     """
-    mechanism, still = trajectory.mechanism, np.zeros_like(trajectory.q_e)
+    mechanism, still, t = trajectory.mechanism, np.zeros_like(trajectory.q_e), trajectory.t
     poses = body_poses(mechanism, trajectory.q_r, still, trajectory.loops)
     desired = None
     if trajectory.is_machine and trajectory.loops is None:
         desired = body_poses(mechanism, trajectory.desired.q, still).end
-    return poses_figure(views, poses, trajectory.t, title, desired)
-
-
-@styled
-def poses_figure(
-    views: Sequence[ArmView],
-    poses: Poses,
-    t: np.ndarray,
-    title: str,
-    desired: np.ndarray | None = None,
-) -> Figure:
-    """Return the picture of `machine_figure`; `desired` (n, d), m, is a path beside the own."""
     paths = {} if desired is None else {DESIRED: (desired, GREY)}
     traced = "end-effector" if poses.traced is poses.end else "last joint that moves"
     paths[f"path of the {traced}"] = poses.traced, ORANGE

@@ -98,13 +98,9 @@ def _lines(file: str) -> list[tuple[int, list[str]]]:
     lines = [(k, x) for k, x in numbered if x.strip() and not x.lstrip().startswith("#")]
     first = lines[0][1] if lines else ""
     separator = next((item for item in (";", "\t") if item in first), ",")
-    return [(k, _cells(x, separator)) for k, x in lines]
-
-
-def _cells(line: str, separator: str) -> list[str]:
-    """Split a line; spreadsheets may put names in quotes, and commas before decimals."""
-    cells = (cell.strip().strip('"') for cell in line.split(separator))
-    return [cell.replace(",", ".") for cell in cells]
+    # Spreadsheets may put names in quotes, and commas before decimals.
+    split = ((k, line.split(separator)) for k, line in lines)
+    return [(k, [x.strip().strip('"').replace(",", ".") for x in cells]) for k, cells in split]
 
 
 def _row(where: str, names: Sequence[str], cells: Sequence[str]) -> list[float]:

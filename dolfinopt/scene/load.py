@@ -35,7 +35,7 @@ from dolfinopt.scene.tables.arms import MAX_CELLS, SIZE_KEYS, Arm
 from dolfinopt.scene.tables.base import Refusal, input_error, loc_of, shown
 from dolfinopt.scene.tables.design import Law
 from dolfinopt.scene.tables.motion import Motion, Reduction
-from dolfinopt.scene.toml import read_toml, tomllib
+from dolfinopt.scene.toml import read_toml
 
 __all__ = [
     "FILE_KEYS",
@@ -50,7 +50,6 @@ __all__ = [
     "read_scene",
     "resolve_file",
     "scene_from_dict",
-    "tomllib",
 ]
 
 

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
-from dolfinopt.scene.toml import tomllib
+from dolfinopt.data import tables_of
 
 
 class CatalogueMaterial(NamedTuple):
@@ -38,10 +37,8 @@ class CatalogueMaterial(NamedTuple):
         return {key: value for key, value in known if key != "source" and value is not None}
 
 
-_FILE = Path(__file__).with_name("materials.toml")
 CATALOGUE: Mapping[str, CatalogueMaterial] = {
-    name: CatalogueMaterial(**values)
-    for name, values in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
+    name: CatalogueMaterial(**values) for name, values in tables_of("scene/materials.toml").items()
 }
 
 

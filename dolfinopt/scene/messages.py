@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Annotated, Any, NamedTuple, get_origin
 
 from pydantic import TypeAdapter, ValidationError
@@ -358,79 +359,57 @@ def implausible(scene: Scene) -> list[str]:
 
     Every sentence names key, value, what is usual, and what follows from it.
     """
-    return [
-        *_materials(scene),
-        *_sizes(scene),
-        *_motion(scene),
-        *_solid_ends(scene),
-        *_old_words(scene),
-    ]
+    groups = (_materials(scene), _sizes(scene), _motion(scene), _others(scene))
+    return list(dict.fromkeys(chain(*groups)))  # arms mostly have one material: no sentence twice
 
 
-def _old_words(scene: Scene) -> list[str]:
-    """Tell older words, in one line."""
-    if not scene.old_words:
-        return []
-    rewrite = f"dolfinopt keys --upgrade {scene.source} rewrites the scene"
-    return [f"older words: {'; '.join(scene.old_words)}; {rewrite}"]
-
-
-def _materials(scene: Scene) -> list[str]:
-    sentences: dict[str, None] = {}  # arms mostly have one material: no sentence twice
+def _materials(scene: Scene) -> Iterator[str]:
     for index, arm in enumerate(scene.arms):
-        if arm.sid is not None:
-            continue
-        solid = scene.material_of(index)
         for key, unit, (low, high) in (
             ("young_modulus", "Pa", YOUNG_MODULUS),
             ("density", "kg/m3", DENSITY),
         ):
-            value = getattr(solid, key)
+            value = getattr(scene.material_of(index), key)
             where = f"arms.{arm.name}" if getattr(arm, key) is not None else "material"
-            values = value if isinstance(value, tuple) else (value,)
-            for item in (entry for entry in values if not low <= entry <= high):
-                sentences[
-                    f"{where}.{key} = {item:g} {unit} is outside the range of structural "
-                    f"materials, {low:g} to {high:g} {unit}; check the unit"
-                ] = None
-    return list(sentences)
+            for item in value if isinstance(value, tuple) else (value,):
+                if arm.sid is None and not low <= item <= high:
+                    yield (
+                        f"{where}.{key} = {item:g} {unit} is outside the range of structural "
+                        f"materials, {low:g} to {high:g} {unit}; check the unit"
+                    )
 
 
-def _sizes(scene: Scene) -> list[str]:
-    sentences = []
+def _sizes(scene: Scene) -> Iterator[str]:
     for index, arm in enumerate(scene.arms):
-        radius = scene.filter_radius(index) if arm.designed else 0.0
         if not arm.own:
             continue
         if arm.height > arm.length and arm.interface_offset is None:
-            sentences.append(
+            yield (
                 f"arms.{arm.name}: its height, {arm.height:g} m, exceeds its length, "
                 f"{arm.length:g} m, which is measured from joint to joint; check both"
             )
         if arm.length > SLENDER * arm.height or arm.thickness > SLENDER * arm.height:
-            sentences.append(
+            yield (
                 f"arms.{arm.name}: length {arm.length:g} m, height {arm.height:g} m and thickness "
                 f"{arm.thickness:g} m differ by more than a factor of {SLENDER:g}; check the units"
             )
-        if radius > arm.height:
-            sentences.append(
+        if arm.designed and (radius := scene.filter_radius(index)) > arm.height:
+            yield (
                 f"design.filter_radius = {radius:g} m exceeds the height of arm {arm.name!r}, "
                 f"{arm.height:g} m: its design cannot vary across the arm"
             )
-    return sentences
 
 
-def _motion(scene: Scene) -> list[str]:
-    result = []
+def _motion(scene: Scene) -> Iterator[str]:
     damping, motion = scene.damping.stiffness_proportional, scene.motion
     if need_of(scene, "motion") and damping > motion.duration:
-        result.append(
+        yield (
             f"damping.stiffness_proportional = {damping:g} s: deflections relax in that time, "
             f"longer than motion.duration = {motion.duration:g} s, so that the arms hardly "
             "deflect; usual values are 1e-5 to 1e-2 s"
         )
     if max(map(abs, motion.gravity)) > GRAVITY:
-        result.append(
+        yield (
             f"motion.gravity = {list(motion.gravity)} m/s2 exceeds {GRAVITY:g} m/s2; that of the "
             "Earth is 9.81"
         )
@@ -439,20 +418,22 @@ def _motion(scene: Scene) -> list[str]:
         for index, arm in enumerate(scene.arms)
     )
     if scene.payload.mass > HEAVY * mass:
-        result.append(
+        yield (
             f"payload.mass = {scene.payload.mass:g} kg is more than {HEAVY:g} times the mass of "
             f"all arms, {mass:.3g} kg"
         )
-    return result
 
 
-def _solid_ends(scene: Scene) -> list[str]:
-    """Tell where the default of solid ends comes to nothing."""
-    return [
-        f"arms.{arm.name}.cells = {list(arm.cells)}: too coarse for the solid ends of "
-        f"{arm.solid_ends:.3g} m that are kept by default, so that the joint may end up in void; "
-        "take more cells along the arm, or state arms.passive"
-        for arm in scene.arms
-        if arm.designed and arm.cells is not None and arm.passive is None
-        if not arm.passive_columns
-    ]
+def _others(scene: Scene) -> Iterator[str]:
+    """Yield where the default of solid ends comes to nothing, and older words, in one line."""
+    for arm in scene.arms:
+        ends = arm.designed and arm.cells is not None and arm.passive is None
+        if ends and not arm.passive_columns:
+            yield (
+                f"arms.{arm.name}.cells = {list(arm.cells or ())}: too coarse for the solid ends "
+                f"of {arm.solid_ends:.3g} m that are kept by default, so that the joint may end up "
+                "in void; take more cells along the arm, or state arms.passive"
+            )
+    if scene.old_words:
+        rewrite = f"dolfinopt keys --upgrade {scene.source} rewrites the scene"
+        yield f"older words: {'; '.join(scene.old_words)}; {rewrite}"

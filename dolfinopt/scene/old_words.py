@@ -9,14 +9,13 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
+from dolfinopt.data import tables_of
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import input_error, rows
 from dolfinopt.scene.tables.joints import INBOARD, OUTBOARD, site_of
 from dolfinopt.scene.tables.machine import GROUND
-from dolfinopt.scene.toml import tomllib
 
 Tree = dict[str, Any]
 Row = dict[str, Any]
@@ -61,17 +60,18 @@ class OldWord:
         if self.only_with and row.get(self.only_with[0]) != self.only_with[1]:
             return
         table, key = self.new.split(".")
-        translation = TRANSLATIONS.get(self.old)
-        result = translation(tree, row, key, value) if translation else value
+        if translation := TRANSLATIONS.get(self.old):
+            value = translation(value, row.get(key), row, tree)
         target = row if table == self.old.partition(".")[0] else tree.setdefault(table, {})
-        if result is not None:
-            target[key] = result
+        if value is not None:
+            target[key] = value
 
 
 # -- values that are other ones now --------------------------------------------------------------
 
-# Tree, row of the older key, key of now and the older value; returns that of now, None: none.
-Translation = Callable[[Tree, Row, str, Any], Any]
+# The older value, that of the key of now in the same row, row and tree; returns the value of now,
+# None: none.
+Translation = Callable[[Any, Any, Row, Tree], Any]
 
 
 def scaled(value: Any, factor: Any) -> Any:
@@ -83,41 +83,41 @@ def scaled(value: Any, factor: Any) -> Any:
     return float(value) * factor if is_number and not isinstance(value, bool) else value
 
 
-def _scaled(tree: Tree, row: Row, key: str, value: Any) -> Any:
-    return scaled(row.get(key), value)
+def _scaled(factor: Any, value: Any, row: Row, tree: Tree) -> Any:
+    return scaled(value, factor)
 
 
-def _site(tree: Tree, row: Row, key: str, value: Any) -> str:
+def _site(interface: Any, arm: Any, row: Row, tree: Tree) -> str:
     """Return "arm.interface" of the arm that a row states, else of the last one."""
-    arm = row.get(key)
     if arm is None:
         arm = next((item.get("name") for item in reversed(rows(tree, "arms"))), "")
     name = site_of(str(arm))[0]
-    return name if str(value).casefold() == OUTBOARD else f"{name}.{value}"
+    return name if str(interface).casefold() == OUTBOARD else f"{name}.{interface}"
 
 
-def _symmetric(words: Mapping[bool, Any], tree: Tree, row: Row, key: str, value: Any) -> Any:
+def _symmetric(words: Mapping[bool, Any], value: Any, known: Any, row: Row, tree: Tree) -> Any:
     """Return `symmetric` of one more symmetry: by whether the arm has that about y = 0."""
     arms = rows(tree, "arms")
-    before = arms[max(0, arms.index(row) - 1)] if key not in row else row
-    about_y = before.get(key) in (True, "yz", "y-extruded")
+    if "symmetric" not in row:
+        known = arms[max(0, arms.index(row) - 1)].get("symmetric")
+    about_y = known in (True, "yz", "y-extruded")
     return words[about_y] if value else about_y
 
 
-def _bore(name: str, tree: Tree, row: Row, key: str, value: Any) -> list[Row]:
+def _bore(name: str, value: Any, interfaces: Any, row: Row, tree: Tree) -> list[Row]:
     given = value if isinstance(value, Mapping) else {}
-    others = row.get(key) or []
+    others = interfaces or []
     known: Row = next((other for other in others if other.get("name") == name), {})
     first = {"name": name, **known, **given}
     return [first, *(other for other in others if other.get("name") != name)]
 
 
-def _body(tree: Tree, row: Row, key: str, value: Any) -> Any:
+def _body(value: Any, mesh: Any, row: Row, tree: Tree) -> Any:
     row.pop("cells", None)
     return value
 
 
-def _turned(tree: Tree, row: Row, key: str, value: Any) -> Any:
+def _turned(axis: Any, angle: Any, row: Row, tree: Tree) -> Any:
     """Return roll, pitch and yaw of a turn about an axis; give them to arms that state no axis."""
     if not tree.get("joints"):
         return None  # in the plane there is one axis
@@ -125,10 +125,10 @@ def _turned(tree: Tree, row: Row, key: str, value: Any) -> Any:
     for arm in arms if row is material else arms[arms.index(row) + 1 :]:
         if "angle_axis" in arm:
             break
-        if key in arm:
-            arm[key] = _roll_pitch_yaw(value, arm[key])
-    usual = material.get(key) if isinstance(material, dict) else None
-    return _roll_pitch_yaw(value, row.get(key, usual))
+        if "angle" in arm:
+            arm["angle"] = _roll_pitch_yaw(axis, arm["angle"])
+    usual = material.get("angle") if isinstance(material, dict) else None
+    return _roll_pitch_yaw(axis, angle if "angle" in row else usual)
 
 
 def _roll_pitch_yaw(axis: Any, angle: Any) -> Any:
@@ -142,30 +142,6 @@ def _roll_pitch_yaw(axis: Any, angle: Any) -> Any:
         return angle  # as it is, which may be refused
 
 
-def _way(tree: Tree, row: Row, key: str, value: Any) -> Any:
-    return None if tree.get("joints") else value
-
-
-def _eroded(tree: Tree, row: Row, key: str, value: Any) -> str | None:
-    return None if value == "nominal" else f"robust-{value}"
-
-
-def _first_mode(tree: Tree, row: Row, key: str, value: Any) -> Any:
-    return "first" if value is True else value or None
-
-
-def _first_joint(tree: Tree, row: Row, key: str, value: Any) -> list[Any]:
-    return [value, *(row.get(key) or [])[1:]]
-
-
-def _exact(tree: Tree, row: Row, key: str, value: Any) -> str | None:
-    return "exact" if value else None
-
-
-def _error(tree: Tree, row: Row, key: str, value: Any) -> Any:
-    return None if isinstance(row.get(key, 1), int) else value
-
-
 TRANSLATIONS: Mapping[str, Translation] = {
     "arms.symmetric_z": partial(_symmetric, {True: "yz", False: "z"}),
     "arms.extruded": partial(_symmetric, {True: "y-extruded", False: "extruded"}),
@@ -177,20 +153,19 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "joints.parent_interface": _site,
     "payload.interface": _site,
     "forces.interface": _site,
-    "closures.side": _way,
-    "reduction.tolerance": _error,
+    "closures.side": lambda side, _, row, tree: None if tree.get("joints") else side,
+    "reduction.tolerance": lambda error, count, *_: (
+        error if isinstance(count, str | float) else None
+    ),
     "control.stiffness_factor": _scaled,
     "control.damping_factor": _scaled,
-    "optimizer.exact_iterations": _exact,
-    "design.limits_on": _eroded,
-    "objective.follow": _first_mode,
-    "motion.start_angle": _first_joint,
+    "optimizer.exact_iterations": lambda count, *_: "exact" if count else None,
+    "design.limits_on": lambda word, *_: None if word == "nominal" else f"robust-{word}",
+    "objective.follow": lambda value, *_: "first" if value is True else value or None,
+    "motion.start_angle": lambda angle, joints, *_: [angle, *(joints or [])[1:]],
 }
 
-_FILE = Path(__file__).with_name("old_words.toml")
-OLD_WORDS = tuple(
-    OldWord(old, **entry) for old, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
-)
+OLD_WORDS = tuple(OldWord(old, **entry) for old, entry in tables_of("scene/old_words.toml").items())
 
 
 def is_old(path: tuple[Any, ...]) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from dolfinopt.data import tomllib
 from dolfinopt.scene.inheritance import BODY
 from dolfinopt.scene.messages import (
     Override,
@@ -25,7 +26,6 @@ from dolfinopt.scene.old_words import CLOSURE, is_old, scaled
 from dolfinopt.scene.tables.arms import MESH_KEYS
 from dolfinopt.scene.tables.base import Loc, cut, input_error, rows
 from dolfinopt.scene.tables.material import material_keys
-from dolfinopt.scene.toml import tomllib
 
 Tree = dict[str, Any]
 

@@ -1,13 +1,11 @@
 """A scene: everything a user can ask for, validated once, frozen.
 
-Each table has its file in `tables/`. A key is a field; its description ends with the unit in
-brackets, "[-]" where there is none.
+Each table has its file in `tables/`: a key is a field, whose meaning and unit stand in keys.toml.
 """
 
 from __future__ import annotations
 
 import copy
-import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,12 +19,19 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
-from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, setting, table_in
-from dolfinopt.scene.tables.closures import Closures
+from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, table_in
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
-from dolfinopt.scene.tables.feed_forward import LEAD_SHARE, FeedForward
 from dolfinopt.scene.tables.joints import place_of
-from dolfinopt.scene.tables.machine import Control, Damping, Force, Joint, Payload
+from dolfinopt.scene.tables.machine import (
+    LEAD_SHARE,
+    Closures,
+    Control,
+    Damping,
+    FeedForward,
+    Force,
+    Joint,
+    Payload,
+)
 from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction, Simulation
 from dolfinopt.scene.tables.objective import Constraints, Limit, Objective, Scenario
@@ -42,54 +47,28 @@ def check_scene_name(name: str) -> str:
 class Scene(Table):
     """A complete, valid scene. Two scenes are equal if all their keys are; `source` is no key."""
 
-    name: Annotated[str, AfterValidator(check_scene_name)] = setting(
-        "title of the scene; default: the file's name without extension [-]"
+    name: Annotated[str, AfterValidator(check_scene_name)]
+    material: Material
+    interpolation: Interpolation = Field(default_factory=Interpolation)
+    arms: tuple[Arm, ...]
+    joints: tuple[Joint, ...] = ()
+    motion: Motion = Field(examples=['[motion] with path = "arc", radius, duration and horizon'])
+    control: Control | None = None
+    feed_forward: FeedForward = Field(default_factory=FeedForward)
+    closures: tuple[Closures, ...] = ()
+    payload: Payload = Field(
+        examples=["[payload] with mass = 2.0 [kg], or mass = 0.0 without a load"]
     )
-    material: Material = setting("the solid material")
-    interpolation: Interpolation = Field(default_factory=Interpolation, description="material law")
-    arms: tuple[Arm, ...] = setting("arms from the cart outwards")
-    joints: tuple[Joint, ...] = setting(
-        (),
-        "joints of a machine in space, a tree on the ground; without this table the "
-        "arms are a chain in the plane",
-    )
-    motion: Motion = setting(
-        "prescribed motion", examples=['[motion] with path = "arc", radius, duration and horizon']
-    )
-    control: Control | None = setting(
-        None,
-        "feedback control; without this table the rigid coordinates follow the desired "
-        "motion exactly",
-    )
-    feed_forward: FeedForward = Field(
-        default_factory=FeedForward,
-        description="corrections of joints that keep the tip on its path",
-    )
-    closures: tuple[Closures, ...] = setting(
-        (),
-        "joints that close loops: in the plane a pin or a slider at the last arm's "
-        "end; without this table the machine is a tree, or a chain",
-    )
-    payload: Payload = setting(
-        "load of the end-effector",
-        examples=["[payload] with mass = 2.0 [kg], or mass = 0.0 without a load"],
-    )
-    forces: tuple[Force, ...] = setting(
-        (), "given forces on interfaces of arms; none without this table"
-    )
-    damping: Damping = Field(default_factory=Damping, description="structural damping")
-    reduction: Reduction = Field(default_factory=Reduction, description="model reduction")
-    simulation: Simulation = Field(default_factory=Simulation, description="time integration")
-    objective: Objective = Field(default_factory=Objective, description="what is minimised")
-    constraints: Constraints = Field(
-        default_factory=Constraints, description="limits besides the volume"
-    )
-    design: Design = Field(default_factory=Design, description="design variables")
-    optimizer: Optimizer = Field(default_factory=Optimizer, description="optimiser")
-    part: Part = Field(default_factory=Part, description="parts for the workshop")
-    scenarios: tuple[Scenario, ...] = setting(
-        (), "scenarios that the objective combines; none: the scene itself"
-    )
+    forces: tuple[Force, ...] = ()
+    damping: Damping = Field(default_factory=Damping)
+    reduction: Reduction = Field(default_factory=Reduction)
+    simulation: Simulation = Field(default_factory=Simulation)
+    objective: Objective = Field(default_factory=Objective)
+    constraints: Constraints = Field(default_factory=Constraints)
+    design: Design = Field(default_factory=Design)
+    optimizer: Optimizer = Field(default_factory=Optimizer)
+    part: Part = Field(default_factory=Part)
+    scenarios: tuple[Scenario, ...] = ()
 
     _source: str = PrivateAttr("<scene>")
     _derived: tuple[tuple[str, str], ...] = PrivateAttr(())  # (table, key), see `to_tree`
@@ -531,6 +510,8 @@ def file_digest(path: Path) -> str:
     Raises:
         InputError: the file cannot be read.
     """
+    import hashlib  # 2 ms, which help and most scenes do not need
+
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -36,6 +36,7 @@ from typing import Any
 
 import numpy as np
 
+from dolfinopt.data import filled
 from dolfinopt.disk import write_arrays, write_text
 from dolfinopt.errors import InputError
 
@@ -234,44 +235,22 @@ def write_sid(path: Path, data: StandardInputData) -> None:
 
 def sid_text(data: StandardInputData) -> str:
     """Return the content of the text file, numbers with 17 digits and Fortran's exponent."""
-    nq = data.num_modes
-    comment = " ".join(data.comment.split())
-    lines = [
-        f"{len(data.nodes):5d}{nq:5d}    :No. nodes, No. modes:{comment}",
-        " part",
-        _entry(6, "new modal", ""),
-        " " * 11 + "refmod",
-        _entry(16, "mass", _number(data.mass)),
-        _entry(16, "nelastq", f"{nq:5d}"),
-    ]
-    for k, name in enumerate(data.names, 1):
-        lines.append(_entry(16, f"ielastq ({k:4d})", name))
-    lines += [" " * 11 + "end refmod", " " * 11 + "frame"]
-    for node in data.nodes:
-        lines.append(_entry(16, "new node", f"{node.name:>8}"))
-        lines.append(_entry(21, "rframe", node.rframe))
-        for name in NODE:
-            matrix = getattr(node, name)
-            if matrix is not None:
-                lines += _matrix_lines(21, name, matrix)
-        lines.append(" " * 16 + "end node")
-    lines.append(" " * 11 + "end frame")
-    for name in BODY:
-        lines += _matrix_lines(11, name, getattr(data, name))
-    lines += [" " * 6 + "end modal", " end part"]
-    return "\n".join(lines) + "\n"
-
-
-def _entry(indent: int, key: str, value: str) -> str:
-    return f"{' ' * indent + key:<48}= {value}".rstrip()
+    return filled(
+        "body.sid.jinja",
+        {"number": _number, "written": _written},
+        data=data,
+        comment=" ".join(data.comment.split()),
+        of_node=NODE,
+        of_body=BODY,
+    )
 
 
 def _number(value: float) -> str:
     return f"{value: .16E}".replace("E", "D")
 
 
-def _matrix_lines(indent: int, name: str, matrix: Taylor) -> list[str]:
-    """Write what a reader would not guess from a missing entry."""
+def _written(matrix: Taylor) -> tuple[dict[str, int], list[tuple[str, float]]]:
+    """Return header and entries of a matrix: what a reader would not guess from a missing one."""
     (nrow, ncol), nq, structure = matrix.M0.shape, matrix.M1.shape[1], matrix.structure
     entries = _filled(matrix.M0)
     if structure == SYMMETRIC and nrow == ncol:
@@ -281,14 +260,13 @@ def _matrix_lines(indent: int, name: str, matrix: Taylor) -> list[str]:
     elif structure in (ZERO, UNIT):
         structure = GENERAL if entries.any() else ZERO
     header = (matrix.order, nrow, ncol, nq, matrix.nqn, structure)
-    lines = [" " * indent + name]
-    lines += [_entry(26, key, f"{value:4d}") for key, value in zip(HEADER, header, strict=True)]
-    for row, col in np.argwhere(entries):
-        lines.append(_entry(26, f"m0( {row + 1}, {col + 1})", _number(matrix.M0[row, col])))
-    for row, k, col in np.argwhere(_filled(matrix.M1)) if matrix.order else ():
-        value = _number(matrix.M1[row, k, col])
-        lines.append(_entry(26, f"m1( {row + 1}, {k + 1}, {col + 1})", value))
-    return [*lines, " " * indent + f"end {name}"]
+    higher = _filled(matrix.M1) & (matrix.order > 0)
+    values = [
+        (f"{name}( {', '.join(str(i + 1) for i in place)})", array[tuple(place)])
+        for name, array, shown in (("m0", matrix.M0, entries), ("m1", matrix.M1, higher))
+        for place in np.argwhere(shown)
+    ]
+    return dict(zip(HEADER, header, strict=True)), values
 
 
 def _filled(values: np.ndarray) -> np.ndarray:

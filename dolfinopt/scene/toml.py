@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import re
-import sys
 from typing import Any
 
+from dolfinopt.data import tomllib
 from dolfinopt.scene.tables.base import input_error, toml_value
 from dolfinopt.scene.text import read_text
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 __all__ = ["read_toml", "toml_value", "tomllib"]
 

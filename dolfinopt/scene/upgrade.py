@@ -8,10 +8,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from dolfinopt.data import tomllib
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import scene_from_dict
 from dolfinopt.scene.old_words import read_old_words
-from dolfinopt.scene.toml import read_toml, toml_value, tomllib
+from dolfinopt.scene.toml import read_toml, toml_value
 
 HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z0-9_.-]+)\s*\]{1,2}\s*(#.*)?$")
 KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")

@@ -5,16 +5,15 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from dolfinopt.errors import InputError
 from dolfinopt.multibody.kinematics import lengths
-from dolfinopt.output.design import designed
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.plots.panels import Line, Panel, panel_figure
 from dolfinopt.plots.style import look
@@ -22,36 +21,12 @@ from dolfinopt.scene.load import Scene
 from dolfinopt.study.tables import Table, html_page
 from dolfinopt.study.variants import differences
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-    from dolfinopt.multibody.tree import Mechanism
-    from dolfinopt.output.design import ArmView
-
 Summary = Mapping[str, Any]  # content of summary.json
 BEFORE, AFTER = "before", "after"
 LOOKS = {BEFORE: look(1), AFTER: look(0)}  # as an initial and an optimised design
 
 
 # -- table -----------------------------------------------------------------------------------
-
-
-def compare_runs(before: Path, after: Path) -> Table:
-    """Return `before_after` of the runs in two folders."""
-    return before_after(_summary(before), _summary(after))
-
-
-def _summary(run: Path) -> Summary:
-    path = run / "summary.json"
-    try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError) as error:
-        raise _unreadable(path, error) from None
-
-
-def _unreadable(path: Path, error: Exception) -> InputError:
-    return InputError(f"{path}: cannot be read ({type(error).__name__}); name a finished run")
 
 
 def before_after(before: Summary, after: Summary) -> Table:
@@ -100,40 +75,33 @@ def _figures(summary: Summary) -> Iterator[tuple[str, float | None, str]]:
 
 @dataclass(frozen=True, eq=False)
 class Side:
-    """One of the two runs, in space."""
+    """One of the two runs."""
 
     folder: Path  # as the user named it
     scene: Scene
     summary: Summary
-    views: list[ArmView]  # of all arms, in the scene's order
-    mechanism: Mechanism
     t: np.ndarray  # (n,) s
-    q_r: np.ndarray  # (n, joints) rad or m
     deviation: np.ndarray  # (n,) of the tool from where rigid links carry it, m
     drive_forces: Mapping[str, np.ndarray]  # (n,) by the drive's name, N or N m
 
 
-def read_side(
-    folder: Path, scene: Scene, views: list[ArmView], bodies: Mapping[int, ShapeIntegrals]
-) -> Side:
-    """Return a finished run with its motion, see `Side`; `bodies` of the arms that it designs.
+def read_side(folder: Path, scene: Scene) -> Side:
+    """Return a finished run with its motion, see `Side`.
 
     InputError where it has no summary.json or trajectory.npz, or another machine's.
     """
-    from dolfinopt.arms.arm import chain_of
-    from dolfinopt.motion.build import build_mechanism
-
-    summary = _summary(folder)
-    mechanism = build_mechanism(scene, chain_of(scene, bodies))
-    path = folder / "trajectory.npz"
+    path = folder / "summary.json"
     try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+        path = folder / "trajectory.npz"
         with np.load(path, allow_pickle=False) as data:
             forces = data["joint_forces"][:, scene.driven_columns].T
             by_drive = dict(zip(scene.driven, forces, strict=True))
-            motion = data["t"], data["q_r"], lengths(data["deviation"]), by_drive
-            return Side(folder, scene, summary, views, mechanism, *motion)
+            return Side(folder, scene, summary, data["t"], lengths(data["deviation"]), by_drive)
     except Exception as error:  # whatever a foreign file may raise
-        raise _unreadable(path, error) from None
+        raise InputError(
+            f"{path}: cannot be read ({type(error).__name__}); name a finished run"
+        ) from None
 
 
 def before_after_page(
@@ -141,19 +109,12 @@ def before_after_page(
 ) -> str:
     """Return the page of two runs of one machine, with the table of `before_after`.
 
-    `sections` are straight members beside the run after, see `sections.sections_of`.
+    It shows the pictures of machine and links that the runs have drawn. `sections` are straight
+    members beside the run after, see `sections.sections_of`.
     """
-    from dolfinopt.plots.machine import poses_figure
-    from dolfinopt.plots.poses import body_poses
-
     sides, rows = {BEFORE: before, AFTER: after}, table.frame
     on_top = rows["figure"].str.startswith(("mass of", "largest tool", "first frequency"))
     on_top &= (rows["figure"] != "mass of all arms") & rows[[BEFORE, AFTER]].notna().all(axis=1)
-    machines = []
-    for label, side in sides.items():
-        still = np.zeros((len(side.t), side.mechanism.num_coordinates))
-        poses = body_poses(side.mechanism, side.q_r, still)
-        machines.append((label, _png(poses_figure(side.views, poses, side.t, label))))
     return html_page(
         "before_after.html",
         title=table.title,
@@ -162,8 +123,8 @@ def before_after_page(
             (row.figure, f"{row.before:.4g} → {row.after:.4g} {row.unit}")
             for row in rows[on_top].itertuples()
         ],
-        machines=machines,
-        links=list(_links(sides)),
+        machines=_drawn(sides, "machine.png"),
+        links=_drawn(sides, "design.png"),
         curves=list(_curves(sides)),
         table=table,
         sections=sections,
@@ -172,15 +133,10 @@ def before_after_page(
     )
 
 
-def _links(sides: Mapping[str, Side]) -> Iterator[tuple[str, bytes]]:
-    """Yield every link that one of the runs designs, by its name: both to one scale."""
-    from dolfinopt.plots.design import design_figure
-
-    result = [(label, view) for label, side in sides.items() for view in designed(side.views)]
-    for name in dict.fromkeys(view.name for _, view in result):
-        views = [replace(view, name=label) for label, view in result if view.name == name]
-        masses = {view.name: sides[view.name].summary["mass"][name] for view in views}
-        yield name, _png(design_figure(views, name, masses))
+def _drawn(sides: Mapping[str, Side], name: str) -> dict[str, bytes]:
+    """Return the picture of this name by the run, as far as they have one."""
+    files = {label: side.folder / name for label, side in sides.items()}
+    return {label: file.read_bytes() for label, file in files.items() if file.is_file()}
 
 
 def _curves(sides: Mapping[str, Side]) -> Iterator[tuple[str, bytes]]:
@@ -199,11 +155,6 @@ def _plot(
     """Return curves of both runs over time, and their title."""
     lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
     panel = Panel(title, "time [s]", label, lines, y_log=False)
-    return title, _png(panel_figure("", [[panel]], LOOKS))
-
-
-def _png(figure: Figure) -> bytes:
-    """Return a figure as a picture of the page."""
     stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()
+    panel_figure("", [[panel]], LOOKS).savefig(stream, format="png")
+    return title, stream.getvalue()

@@ -9,9 +9,10 @@ damping.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,10 +24,19 @@ from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
 from dolfinopt.output.design import Designed, arms_with_design
 from dolfinopt.output.feed_forward import finer_deviation, simulated_with, with_feed_forward
+from dolfinopt.output.trajectory import drive_units
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.cases import Case, Outcome, Steps
-from dolfinopt.study.studies import DEVIATION, deviation_panels, results_of, single_design
+from dolfinopt.study.studies import (
+    DEVIATION,
+    Report,
+    Rows,
+    deviation_panels,
+    reported,
+    single_design,
+    with_failures,
+)
 from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "motions"  # of the study's files, and of the folder of the shaped joints
@@ -41,20 +51,6 @@ SHAPERS: dict[ShaperKind, str] = {
 KEPT = ("base", "cart_mass", "joint_height", "gravity", "initial_joints")
 ROWS = 2000  # of a table of shaped joints
 TEN_PERCENT, FIVE_PERCENT = 1.1, 0.95
-
-
-class Motion(NamedTuple):
-    """A motion in the table.
-
-    Attributes:
-        case: its simulation, labelled.
-        longer: by how much it takes longer than the scene's, s.
-        finer: deviation in a finer model, m; None where there is none.
-    """
-
-    case: Case
-    longer: float = 0.0
-    finer: float | None = None
 
 
 def study_motions(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps[Study]:
@@ -79,12 +75,8 @@ def study_motions(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps[
             failed = tuple(text for failure in result.failures for text in failure.failures)
             return Study(NAME, (), (), failed)
         files = [result[item].design for item in searched]
-    motions = _motions(scene, files, folder / NAME)
-    done = yield [motion.case for motion in motions]
-    rows = [(motion, done[motion.case]) for motion in motions]
-    table, figure = report(scene, rows)
-    failed = tuple(text for _, outcome in rows for text in outcome.failures)
-    return Study(NAME, (table,), (figure,), failed)
+    rows = _motions(scene, files, folder / NAME)
+    return (yield from reported(NAME, rows, partial(report, scene=scene)))
 
 
 def machines(scene: Scene) -> dict[str, str]:
@@ -100,24 +92,31 @@ def machines(scene: Scene) -> dict[str, str]:
     return result
 
 
-def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> list[Motion]:
+def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> Rows:
     """Return the motions with the first design, and feed-forward with the second."""
+
+    def row(
+        case: Case, longer: float = 0.0, finer: float = math.nan
+    ) -> tuple[dict[str, Any], Case]:
+        labels = {"motion": case.label, "longer by [s]": longer, "finer model [mm]": 1e3 * finer}
+        return labels, case
+
     rigid, forward = (_judged(with_feed_forward(scene, kind)) for kind in ("none", "tip"))
     first = designs[0]
     place = arms_with_design(MPI.COMM_SELF, rigid, first, Profile())
-    motions = [Motion(Case(rigid, "simulate", first, RIGID), finer=_finer_deviation(place))]
+    rows = [row(Case(rigid, "simulate", first, RIGID), finer=_finer_deviation(place))]
     bodies = {index: arm.reduce(place.x_phys[index]) for index, arm in place.arms.items()}
     frequency, damping_ratio = build_system(rigid, chain_of(rigid, bodies)).slowest_vibration(2)
     if frequency > 0.0 and scene.motion.table_ends == "rest":
         for kind, label in SHAPERS.items():
             shaper = input_shaper(kind, frequency, damping_ratio)
             shaped = write_shaped(rigid, shaper, folder / f"{kind}.csv")
-            motions.append(Motion(Case(shaped, "simulate", first, label), shaper.longer))
+            rows.append(row(Case(shaped, "simulate", first, label), shaper.longer))
     for label, design in zip((FORWARD, DESIGNED), designs, strict=False):
         place = arms_with_design(MPI.COMM_SELF, forward, design, Profile())
         case = Case(forward, "simulate", design, label)
-        motions.append(Motion(case, 2.0 * forward.lead, _finer_deviation(place)))
-    return motions
+        rows.append(row(case, 2.0 * forward.lead, _finer_deviation(place)))
+    return rows
 
 
 def _judged(scene: Scene) -> Scene:
@@ -127,18 +126,16 @@ def _judged(scene: Scene) -> Scene:
     return scene_from_dict(data, scene.source)
 
 
-def _finer_deviation(place: Designed) -> float | None:
-    """Return the largest deviation in a finer model with this one's corrections, m."""
-    scene = place.scene
-    if not scene.reduction.count:
-        return None
-    corrections = None
+def _finer_deviation(place: Designed) -> float:
+    """Return the largest deviation in a finer model with this one's corrections, m; or nan."""
+    scene, corrections = place.scene, None
     if scene.feed_forward.on:
         nominal = simulated_with(place)
-        if nominal is None:
-            return None
-        corrections = nominal.feed_forward
-    return finer_deviation(place, corrections)
+        corrections = None if nominal is None else nominal.feed_forward
+    if not scene.reduction.count or (scene.feed_forward.on and corrections is None):
+        return math.nan
+    finer = finer_deviation(place, corrections)
+    return math.nan if finer is None else finer
 
 
 def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
@@ -163,13 +160,23 @@ def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
 # -- table, sentence, picture ----------------------------------------------------------------
 
 
-def report(scene: Scene, rows: Sequence[tuple[Motion, Outcome]]) -> tuple[Table, LineFigure]:
+def report(frame: pd.DataFrame, scene: Scene) -> Report:
     """Return the table under a sentence, and the deviations over time."""
-    frame = pd.DataFrame([_cells(scene, *row) for row in rows])
-    able = [outcome for _, outcome in rows if not outcome.failure]
-    table = Table("", f"{_verdict(able)} {NOTE}", frame)
+    able = [outcome for outcome in frame["outcome"] if not outcome.failure]
+    columns = [
+        "motion",
+        "mass [kg]",
+        "longer by [s]",
+        DEVIATION,
+        "finer model [mm]",
+        "settling [mm]",
+    ]
+    further = pd.DataFrame([_further(scene, outcome.summary()) for outcome in frame["outcome"]])
+    table = Table(
+        "", f"{_verdict(able)} {NOTE}", with_failures(frame, frame[columns].join(further))
+    )
     title = "Deviation of the tip from the path of each motion"
-    return table, LineFigure("deviation", title, tuple(deviation_panels(able)))
+    return [table], [LineFigure("deviation", title, tuple(deviation_panels(able)))]
 
 
 NOTE = (
@@ -191,22 +198,11 @@ def _verdict(able: Sequence[Outcome]) -> str:
     )
 
 
-def _cells(scene: Scene, motion: Motion, outcome: Outcome) -> dict[str, Any]:
-    """Return a row by column."""
-    summary, known = outcome.summary(), results_of(outcome)
-    cells: dict[str, Any] = {
-        "motion": motion.case.label,
-        "mass [kg]": known["mass [kg]"],
-        "longer by [s]": motion.longer,
-        DEVIATION: known[DEVIATION],
-        "finer model [mm]": math.nan if motion.finer is None else 1e3 * motion.finer,
-        "settling [mm]": known["settling [mm]"],
-    }
-    for name, result in zip(machines(scene), summary.get("scenarios", ()), strict=False):
-        cells[f"{name} [mm]"] = 1e3 * result["max_deviation"]
-    for name in scene.driven:
-        unit = "N" if scene.rigid_units[name] == "m" else "N m"
-        cells[f"peak {name} [{unit}]"] = summary.get("drive_peak", {}).get(name, math.nan)
-    if outcome.failure:
-        cells["failed"] = outcome.failure
+def _further(scene: Scene, summary: Mapping[str, Any]) -> dict[str, float]:
+    """Return by column what other machines do with a motion, and the largest forces of drives."""
+    others = zip(machines(scene), summary.get("scenarios", ()), strict=False)
+    cells = {f"{name} [mm]": 1e3 * result["max_deviation"] for name, result in others}
+    peaks = summary.get("drive_peak", {})
+    for name, unit in drive_units(scene).items():
+        cells[f"peak {name} [{unit}]"] = peaks.get(name, math.nan)
     return cells

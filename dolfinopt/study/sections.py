@@ -17,6 +17,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ import numpy as np
 import pandas as pd
 from scipy.optimize import brentq, minimize
 
+from dolfinopt.data import filled
 from dolfinopt.disk import make_folder, write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.hollow import KINDS, Section, member
@@ -37,22 +39,19 @@ from dolfinopt.study.cases import Case, Outcome, Steps
 from dolfinopt.study.studies import (
     COMPLIANCE,
     DEVIATION,
+    Report,
+    Rows,
     deviation_panels,
-    results_of,
+    reported,
     single_design,
+    with_failures,
 )
 from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "sections"  # of the study's files, and of the folder of the members' meshes
-DESIGN, SAME = "design", "same mass"
+DESIGN, LIGHTEST, SAME = "design", "lightest", "same mass"
 BAR_CELLS = (4, 8)  # of a bar in place of an arm from a file: over its smaller side, at most
 LEAST, MOST = 0.01, 0.95  # shares: thinner walls are foil, thicker ones leave a slit
-VARIED = {
-    2: "In plane stress all parts are as thick as the arm, so that tubes and I sections are none; "
-    "the bar's height is what varies.",
-    3: "Tubes and the I have the outer sides of the arm's envelope, their walls are what varies (a "
-    f"share of {LEAST:g} to {MOST:g} of the largest); walls may buckle, which is not judged.",
-}
 STEPS = 20  # sets of power laws at most
 STEP = 0.03  # relative change of a share from which the exponents are told
 MOVE = 1.0  # largest change of ln s by one set of power laws, halved where they do not hold
@@ -286,36 +285,6 @@ def _balanced(
 # -- the study -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of the table.
-
-    Attributes:
-        kind: of the section, or the design.
-        sizing: how its sizes were chosen.
-        sizes: in mm, with the arms' names and what they are.
-        outcome: of its simulation.
-        lightest: whether the sizes are the least that hold the limits, if any do.
-    """
-
-    kind: str
-    sizing: str
-    sizes: str
-    outcome: Outcome
-    lightest: bool = False
-
-    @property
-    def mass(self) -> float:
-        """Of all arms with a design or a section, kg."""
-        return float(self.outcome.summary().get("designed_mass", math.nan))
-
-    @property
-    def holds(self) -> bool:
-        """Whether it holds every limit but that of the volume."""
-        limits = _limits(self.outcome).values()
-        return not self.outcome.failure and all(limit["met"] for limit in limits)
-
-
 def _limits(outcome: Outcome) -> dict[str, Any]:
     """Return the scene's limits and what becomes of them, without that of the volume."""
     result = outcome.summary().get("constraints", {})
@@ -336,26 +305,25 @@ def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps
     _check_replaceable(scene)
     label, design = single_design(scene, designs, NAME)
     own = Case(scene, "simulate", design, DESIGN)
-    first = Row(DESIGN, label, "", (yield [own])[own])
-    if first.outcome.failure:
-        return Study(NAME, (), (), tuple(first.outcome.failures))
+    first = (yield [own])[own]
+    if first.failure:
+        return Study(NAME, (), (), tuple(first.failures))
     kinds = KINDS[scene.dimension].items()
     every = [Members(scene, kind, section, folder) for kind, section in kinds]
-    asked: list[tuple[Members, str, Shares, bool]] = []
-    for members in every if limited(first.outcome) else ():
+    asked: list[tuple[Members, str, Shares]] = []
+    for members in every if limited(first) else ():
         if result := (yield from lightest(members)):
             shares, holds = result
-            asked.append((members, "lightest" if holds else "nearest to the limits", shares, holds))
-    asked += [(members, SAME, shares, False) for members, shares in _as_heavy(every, first.outcome)]
-    cases = [members.case(shares) for members, _, shares, _ in asked]
-    done = yield cases
-    rows = [first]
-    for (members, sizing, shares, light), case in zip(asked, cases, strict=True):
+            asked.append((members, LIGHTEST if holds else "nearest to the limits", shares))
+    asked += [(members, SAME, shares) for members, shares in _as_heavy(every, first)]
+    rows: Rows = [({"section": DESIGN, "made": label, "sizes [mm]": ""}, own)]
+    for members, sizing, shares in asked:
         sizes = f"{members.section.named}: {members.sizes(shares)}"
-        rows.append(Row(members.kind, sizing, sizes, done[case], light))
-    table, figures = report(scene, rows)
+        labels = {"section": members.kind, "made": sizing, "sizes [mm]": sizes}
+        rows.append((labels, members.case(shares)))
+    study = yield from reported(NAME, rows, partial(report, scene=scene))
     # A member that is too soft to be simulated is a finding, in its row, and no failure.
-    return Study(NAME, (table,), figures)
+    return replace(study, failures=())
 
 
 def _as_heavy(every: Sequence[Members], outcome: Outcome) -> list[tuple[Members, Shares]]:
@@ -428,97 +396,72 @@ def _check_replaceable(scene: Scene) -> None:
 # -- table, sentence, picture ----------------------------------------------------------------
 
 
-def report(scene: Scene, rows: Sequence[Row]) -> tuple[Table, tuple[LineFigure, ...]]:
+def report(frame: pd.DataFrame, scene: Scene) -> Report:
     """Return the table under the sentence that names the winner, and the deviations over time."""
-    text = [verdict(scene, rows), *_notes(scene, rows)]
-    table = Table("", " ".join(text), pd.DataFrame([_cells(scene, row) for row in rows]))
-    shown = [row for row in rows if not row.outcome.failure]
-    light = any(row.lightest for row in shown)
-    shown = [row for row in shown if row.kind == DESIGN or row.lightest or not light]
+    objective = f"objective [{scene.objective.response.unit}]"
+    known = frame.assign(**{objective: [outcome.objective for outcome in frame["outcome"]]})
+    columns = ["section", "made", "sizes [mm]", "mass [kg]", objective, COMPLIANCE, DEVIATION,
+               "settling [mm]", "stress [MPa]", "grayness [-]"]  # fmt: skip
+    limits = pd.DataFrame([_limit_cells(outcome) for outcome in frame["outcome"]])
+    shown = frame[frame["failure"] == ""]
+    if (light := shown["made"] == LIGHTEST).any():
+        shown = shown[light | (shown["section"] == DESIGN)]
     named = [
-        replace(row.outcome, case=replace(row.outcome.case, label=f"{row.kind}, {row.mass:.4g} kg"))
-        for row in shown
+        replace(outcome, case=replace(outcome.case, label=f"{kind}, {mass:.4g} kg"))
+        for kind, mass, outcome in zip(shown["section"], shown["mass [kg]"], shown["outcome"])
     ]
     title = "Deviation with straight members and with the design"
-    return table, (LineFigure("deviation", title, tuple(deviation_panels(named))),)
+    table = Table("", verdict(scene, frame), with_failures(frame, known[columns].join(limits)))
+    return [table], [LineFigure("deviation", title, tuple(deviation_panels(named)))]
 
 
-def verdict(scene: Scene, rows: Sequence[Row]) -> str:
-    """Return the sentence that says who wins.
+def verdict(scene: Scene, frame: pd.DataFrame) -> str:
+    """Return the sentence that says who wins, and what one has to know to read the table.
 
     By mass where the scene limits what members do, the lightest that hold against the design;
     otherwise by the objective, with the same mass.
     """
-    design, *others = rows
-    if not limited(design.outcome):
-        return _by_objective(scene, design, others)
-    over = {
-        name: _excess(limit) for name, limit in _limits(design.outcome).items() if not limit["met"]
-    }
-    missed = ", ".join(f"{name} {100.0 * x:.2g} % over its limit" for name, x in over.items())
-    weight = f"{design.mass:.4g} kg" + f" ({missed})" * bool(over)
-    broken = max(over.values(), default=0.0) > SLIGHT
-    able = [row for row in others if row.lightest and row.holds]
-    if not able:
-        return (
-            "No straight member within the arms' envelope holds the limits, the design weighs "
-            f"{weight}: {'nobody' if broken else 'the design'} wins."
-        )
-    best = min(able, key=lambda row: row.mass)
-    return (
-        f"The lightest straight {best.kind} that holds the limits weighs {best.mass:.4g} kg, the "
-        f"design {weight}: the {best.kind if broken or best.mass < design.mass else DESIGN} wins."
+    design, *others = frame.to_dict("records")
+    is_limited, limits = bool(limited(design["outcome"])), _limits(design["outcome"])
+    able = [row for row in others if not row["failure"]]
+    if is_limited:
+        able = [row for row in able if row["made"] == LIGHTEST and _holds(row["outcome"])]
+    over = {name: _excess(limit) for name, limit in limits.items() if not limit["met"]}
+    kinds = {row["section"] for row in others if row["made"] == SAME}
+    text = filled(
+        "sections.txt.jinja",
+        {},
+        limited=is_limited,
+        design=design,
+        best=min(
+            able,
+            key=lambda row: row["mass [kg]"] if is_limited else row["outcome"].objective,
+            default=None,
+        ),
+        over=over,
+        broken=max(over.values(), default=0.0) > SLIGHT,
+        response=scene.objective.response,
+        dimension=scene.dimension,
+        least=LEAST,
+        most=MOST,
+        sizes=len({owner for owner in scene.owners if owner is not None}),
+        missing=[kind for kind in KINDS[scene.dimension] if kind not in kinds],
     )
+    return " ".join(text.split())
 
 
-def _by_objective(scene: Scene, design: Row, others: Sequence[Row]) -> str:
-    """Return the sentence where nothing but material is limited."""
-    able = [row for row in others if not row.outcome.failure]
-    if not able:
-        return "No straight member within the arms' envelope has the design's mass."
-    best = min(able, key=lambda row: row.outcome.objective)
-    ours, theirs = design.outcome.objective, best.outcome.objective
-    name, unit = scene.objective.response.label, scene.objective.response.unit
-    return (
-        f"With the design's mass of {design.mass:.4g} kg the best straight member, a {best.kind}, "
-        f"has an objective ({name}) of {theirs:.4g} {unit}, the design {ours:.4g} {unit}: the "
-        f"{best.kind if theirs < ours else DESIGN} wins."
-    )
+def _holds(outcome: Outcome) -> bool:
+    """Return whether every limit but that of the volume holds."""
+    return not outcome.failure and all(limit["met"] for limit in _limits(outcome).values())
 
 
-def _notes(scene: Scene, rows: Sequence[Row]) -> list[str]:
-    """Return what one has to know to read the table."""
-    notes = [
-        "Members are straight from joint to joint, uniform, without flanges or bosses.",
-        VARIED[scene.dimension],
-    ]
-    if len({owner for owner in scene.owners if owner is not None}) > 1:
-        notes.append("Every arm has its own size.")
-    kinds = {row.kind for row in rows if row.sizing == SAME}
-    if missing := [kind for kind in KINDS[scene.dimension] if kind not in kinds]:
-        notes.append(f"No {' or '.join(missing)} in the envelope has the design's mass.")
-    return notes
-
-
-def _cells(scene: Scene, row: Row) -> dict[str, Any]:
-    """Return a row by column."""
-    outcome, known = row.outcome, results_of(row.outcome)
-    cells: dict[str, Any]
-    cells = {
-        "section": row.kind,
-        "made": row.sizing,
-        "sizes [mm]": row.sizes,
-        "mass [kg]": row.mass,
-    }
-    cells[f"objective [{scene.objective.response.unit}]"] = outcome.objective
-    for name in (COMPLIANCE, DEVIATION, "settling [mm]", "stress [MPa]", "grayness [-]"):
-        cells[name] = known[name]
+def _limit_cells(outcome: Outcome) -> dict[str, str]:
+    """Return by column what becomes of every limit."""
+    cells = {}
     for name, limit in _limits(outcome).items():
         sign = ">=" if limit["bound"] == "least" else "<="
         key = f"{name.replace('_', ' ')} {sign} {limit['limit']:g} {limit['unit']}"
         cells[key] = f"{limit['value']:.4g} {'met' if limit['met'] else 'not met'}"
-    if outcome.failure:
-        cells["failed"] = outcome.failure
     return cells
 
 

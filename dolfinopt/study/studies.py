@@ -53,7 +53,8 @@ from dolfinopt.study.variants import (
 Item = TypeVar("Item")
 Preset = Literal["payload", "flattening", "coordinates", "objective", "reduction"]
 Design = Case | Path | None  # optimised by a case, of a file, or the initial one
-Rows = list[tuple[dict[str, Any], Case]]
+Row = tuple[dict[str, Any], Case]  # labels by column, and the case
+Rows = list[Row]
 Report = tuple[list[Table], list[Figure]]
 
 COMPLIANCE, DEVIATION = QUANTITIES = ("compliance [N m]", "maximal deviation [mm]")
@@ -225,6 +226,11 @@ def by_design(
         for what in results:
             wide[": ".join(filter(None, (name, what)))] = part[what]
     return wide
+
+
+def with_failures(frame: pd.DataFrame, table: pd.DataFrame) -> pd.DataFrame:
+    """Return a table with a column that tells which rows of the frame failed, if any has."""
+    return table.assign(failed=frame["failure"]) if (frame["failure"] != "").any() else table
 
 
 def lines_by(frame: pd.DataFrame, by: str, x: str, y: str, label: str = "") -> tuple[Line, ...]:

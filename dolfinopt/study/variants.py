@@ -7,11 +7,11 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dolfinopt.data import tables_of
 from dolfinopt.errors import InputError
 from dolfinopt.loading import load_scene
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -19,12 +19,10 @@ from dolfinopt.scene.messages import model_at, unit_of
 from dolfinopt.scene.old_words import in_new_words
 from dolfinopt.scene.schema import flattened
 from dolfinopt.scene.tables.responses import DECLARED, unused_options
-from dolfinopt.scene.toml import tomllib
 
 # Labels; kind and settings of each: the paper's, and those that a comparison adds to them.
-_FILE = Path(__file__).with_name("objectives.toml")
 OBJECTIVES, RESPONSES = (
-    list(group.items()) for group in tomllib.loads(_FILE.read_text(encoding="utf-8")).values()
+    list(group.items()) for group in tables_of("study/objectives.toml").values()
 )
 # Craig-Bampton with this many coordinates stands for the unreduced arm.
 REFERENCE_METHOD, REFERENCE = "craig-bampton", 48

@@ -218,7 +218,7 @@ def test_problems_are_scenes(name):
 @pytest.mark.slow
 def test_problems_are_solved_beside_members_drawn_by_hand():
     """A bar at its limit of the stress is 6.9 mm high, 0.130 kg; cells that it cuts weigh more."""
-    (hand,) = iterations.drawn_by_hand(iterations.ROD, "bar")
+    (hand,) = measure.program("drawn_by_hand").drawn_by_hand("lightest rod", "bar")
     assert -0.05 < hand[6] < 1e-3 and 0.130 < hand[5] < 0.16
     (row,) = iterations.optimised("frozen loads", "half", 2)
     frame = iterations.OPTIMISER.frame([hand, row])

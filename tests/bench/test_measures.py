@@ -45,7 +45,7 @@ def test_scipy_and_radau_agree(problem, reference):
     def error(q):
         return relative_error(problem.mechanism, q - reference.q, reference.q)
 
-    assert error(accuracy.scipy_motion("Radau", 1e-3, reference)) < 1e-2
+    assert error(accuracy.METHODS["SciPy Radau"](1e-3, reference)) < 1e-2
     errors = [error(accuracy.radau_motion(3, tol, reference)) for tol in (1e-3, 1e-5)]
     assert errors[0] < 1e-3 and errors[1] < 1e-5  # the tolerances
 

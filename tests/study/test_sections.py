@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from mpi4py import MPI
 from runs import ROOT, TWO_ARM, by_root, overrides, refusal, run
@@ -20,7 +21,6 @@ from dolfinopt.study.sections import (
     LEAST,
     WORTH,
     Members,
-    Row,
     ahead,
     lightest,
     sections_of,
@@ -132,7 +132,9 @@ def test_none_holds_and_members_of_the_same_mass(bars):
 
 def row(kind, mass, deviation=0.9, lightest=False, objective=1.0):
     values = {} if deviation is None else {"deviation": deviation}
-    return Row(kind, "", "", Found(values, mass, objective), lightest)
+    outcome = Found(values, mass, objective)
+    made = "lightest" if lightest else "same mass"
+    return {"section": kind, "made": made, "mass [kg]": mass, "failure": "", "outcome": outcome}
 
 
 @pytest.mark.parametrize(
@@ -159,7 +161,7 @@ def row(kind, mass, deviation=0.9, lightest=False, objective=1.0):
     ],
 )  # fmt: skip
 def test_the_sentence(rows, said):
-    assert said in verdict(do.load_scene(TWO_ARM), rows)
+    assert said in verdict(do.load_scene(TWO_ARM), pd.DataFrame(rows))
 
 
 def test_bars_in_the_plane(shared_tmp_path, capsys):

@@ -14,7 +14,6 @@ from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
     NAMES_FILE,
-    ByDimension,
     Extent,
     FileName,
     Inertia,
@@ -24,15 +23,12 @@ from dolfinopt.scene.tables.base import (
     Six,
     Three,
     TwoOrThree,
-    Use,
-    setting,
     shown,
     table_in,
 )
 from dolfinopt.scene.tables.design import Region, check_regions
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
-    OF_PARTS,
     Drive,
     Interface,
     Point,
@@ -157,124 +153,33 @@ def check_arm_name(name: str) -> str:
 class Arm(Drive):
     """One flexible arm; a key left out in a scene is taken from the arm before."""
 
-    USES = (
-        Use("wall min_wall max_wall", "hollow"),
-        Use("mass inertia centre", "rigid"),
-        Use("mesh_size cell_shape mesh_scale", "mesh"),
-        *OF_PARTS,
-    )
-    BY_DIMENSION = ByDimension(in_space="centre interfaces", numbers="inertia")
-
-    name: Annotated[str, AfterValidator(check_arm_name)] = setting(
-        "unique name, used in files and messages [-]"
-    )
-    length: Extent = setting(
-        "distance from the inboard joint axis to the outboard one, or to the "
-        "end-effector; 0 only of a rigid arm in space [m]"
-    )
-    height: Length = setting("height in the plane of motion [m]")
-    thickness: Length = setting("thickness normal to the plane of motion [m]")
-    cells: TwoOrThree[CellCount] | None = setting(
-        (200, 12),
-        "number of cells along and across a rectangular arm in plane stress; along, "
-        "over the height and over the thickness of a solid one [-]",
-    )
-    mesh: FileName | None = setting(
-        None,
-        "geometry or mesh file (.geo, .msh, .step, of Abaqus and CalculiX .inp) in place of cells; "
-        "or the whole body, not designed, as standard input data (.sid, .sid_fem) [-]",
-    )
-    mesh_size: Length | None = setting(
-        None,
-        "cell size for a .geo or .step file; default: a .geo file's own; with .step a "
-        "twelfth of the height, of solids a quarter of the smaller of height and thickness [m]",
-    )
-    cell_shape: CellShape | None = setting(
-        None,
-        "cell shape for a .geo or .step file; hexahedron and tetrahedron make the arm "
-        "a solid, with a .msh or .inp file, too [-]",
-    )
-    interface_offset: Length | None = setting(
-        None,
-        "how far the middles of the interfaces of a solid mesh file, or hull, may lie "
-        "from the joints at (0, 0, 0) and (length, 0, 0), with which they move rigidly; default: "
-        "a twentieth of the larger of height and thickness [m]",
-    )
-    mesh_scale: float = setting(
-        1.0,
-        "length of the mesh file's unit: 0.001 of a file in mm; a .step file states its own [m]",
-        ge=1e-9,
-        le=1e9,
-    )
-    element: ElementName | None = setting(
-        None,
-        'finite element: "incompatible" are quadrilaterals and hexahedra that bend '
-        "without locking; default: these, quadratic triangles and tetrahedra [-]",
-    )
-    passive: Extent | None = setting(
-        None,
-        "length kept solid around both interfaces; default: a quarter of the "
-        "height, at most a tenth of the length; with a mesh file 0, its own groups "
-        "[m]",
-    )
-    symmetric: bool | Literal["z", "yz", "extruded", "y-extruded"] = setting(
-        False,
-        "keep the design symmetric about the arm's axis: true, about y = 0; of a solid "
-        'arm also "z", about z = 0, and "yz", about both; of one made of cells "extruded", the '
-        'same over the thickness, and "y-extruded", about y = 0, too [-]',
-    )
-    hollow: bool | SectionOrFile = setting(
-        False,
-        "a thin-walled link of the arm's extents: the outer surface stays, the design "
-        'is the thickness of the wall; true or "box"; "tube" is round, height = thickness; or a '
-        "mesh file (.msh) of a solid whose outer surface the arm has, which every ray from its "
-        "axis meets once; in space, with cells = [nx, ny, nz], of which those on the surface count "
-        "[-]",
-    )
-    wall: WallThickness | None = setting(None, "initial thickness of the wall of a hollow arm [m]")
-    min_wall: WallThickness | None = setting(
-        None, "least thickness of the wall; default: half of wall [m]"
-    )
-    max_wall: WallThickness | None = setting(
-        None,
-        "largest thickness of the wall, also that of the flanges, rings over passive "
-        "at both ends; default: twice wall [m]",
-    )
-    design: str | None = setting(
-        None,
-        "name of an earlier arm whose design this one has: one mesh and one body for both where "
-        "they are alike but for their joints, else scaled to its own length and height, cell by "
-        "cell [-]",
-    )
-    rigid: bool = setting(False, "a rigid bar of solid material, not optimised [-]")
-    mass: Inertia | None = setting(
-        None,
-        "mass of a rigid arm, its centre halfway; default: that of the solid bar [kg]",
-    )
-    inertia: Inertia | Tensor | None = setting(
-        None,
-        "moment of inertia of a rigid arm about its centre, in space the tensor xx, "
-        "yy, zz, xy, xz, yz; default: that of a bar of its mass [kg m2]",
-    )
-    centre: Three[Position] | None = setting(
-        None, "centre of mass of a rigid arm in space, in the arm's frame; default: halfway [m]"
-    )
-    joint_mass: Inertia = setting(
-        0.0, "mass at the outboard interface: motor, gearbox, bearing [kg]"
-    )
-    joint_inertia: Inertia = setting(0.0, "moment of inertia at the outboard interface [kg m2]")
-    material: CatalogueName | None = setting(
-        None,
-        'name of this arm\'s material in the catalogue, e.g. "steel S355"; default: '
-        "that of [material] [-]",
-    )
-    regions: tuple[Region, ...] = setting((), "parts of the arm that stay solid or void")
-    interfaces: tuple[Interface, ...] = setting(
-        (),
-        "in space: further outboard interfaces, each with six coordinates, on which "
-        "joints or the payload sit, and the bores at the ends of a mesh file; taken from the arm "
-        "whose design this one shares alone, the bores with the mesh of the arm before",
-    )
+    name: Annotated[str, AfterValidator(check_arm_name)]
+    length: Extent
+    height: Length
+    thickness: Length
+    cells: TwoOrThree[CellCount] | None = (200, 12)
+    mesh: FileName | None = None
+    mesh_size: Length | None = None
+    cell_shape: CellShape | None = None
+    interface_offset: Length | None = None
+    mesh_scale: float = Field(default=1.0, ge=1e-9, le=1e9)
+    element: ElementName | None = None
+    passive: Extent | None = None
+    symmetric: bool | Literal["z", "yz", "extruded", "y-extruded"] = False
+    hollow: bool | SectionOrFile = False
+    wall: WallThickness | None = None
+    min_wall: WallThickness | None = None
+    max_wall: WallThickness | None = None
+    design: str | None = None
+    rigid: bool = False
+    mass: Inertia | None = None
+    inertia: Inertia | Tensor | None = None
+    centre: Three[Position] | None = None
+    joint_mass: Inertia = 0.0
+    joint_inertia: Inertia = 0.0
+    material: CatalogueName | None = None
+    regions: tuple[Region, ...] = ()
+    interfaces: tuple[Interface, ...] = ()
 
     _scaled: bool = PrivateAttr(False)
 
@@ -664,17 +569,11 @@ class Arm(Drive):
         index = scene.places[self.name]
         before = scene.arms[:index]
         if not scene.is_spatial:
-            self._check_files(before)
-            self.check_plane_bearing()
-        if self.is_solid and self.flexible and not scene.is_spatial:
-            raise Refusal(
-                "expected two integers (along, across) of an arm in plane stress: a solid arm "
-                "moves in space, and needs [[joints]]",
-                ".cells" if self.cells is not None else ".cell_shape",
-            )
+            self._check_in_plane(before)
         if self.flexible:
             self._check_material(scene, index)
-        self._check_inertia(scene)
+        if problem := tensor_problem(self.inertia):
+            raise Refusal(problem, ".inertia")
         check_interfaces(scene, index)
         check_motor(scene, index)
         check_regions(self)
@@ -700,9 +599,19 @@ class Arm(Drive):
             )
             raise Refusal(refusal.reason, *keys) from None
 
-    def _check_files(self, before: tuple[Arm, ...]) -> None:
-        """Refuse a name with which two files of a part would be one, such as a_face.step."""
-        own = self.name.casefold()
+    def _check_in_plane(self, before: tuple[Arm, ...]) -> None:
+        """Refuse what moves in space alone, and names with which files of parts would be one."""
+        self.check_plane_bearing()
+        if self.length == 0.0:
+            reason = "expected more than 0 without [[joints]]: the machine moves in the plane"
+            raise Refusal(reason, ".length")
+        if self.is_solid and self.flexible:
+            raise Refusal(
+                "expected two integers (along, across) of an arm in plane stress: a solid arm "
+                "moves in space, and needs [[joints]]",
+                ".cells" if self.cells is not None else ".cell_shape",
+            )
+        own = self.name.casefold()  # as a_face.step
         for other in (arm.name.casefold() for arm in before):
             for longer, shorter in ((own, other), (other, own)):
                 if longer.removeprefix(shorter) in PART_FILES:
@@ -711,14 +620,6 @@ class Arm(Drive):
                         "behind it: files of both parts would have one name",
                         ".name",
                     )
-
-    def _check_inertia(self, scene: Scene) -> None:
-        """Refuse an arm in the plane without length, and inertia that no body has."""
-        if problem := tensor_problem(self.inertia):
-            raise Refusal(problem, ".inertia")
-        if self.length == 0.0 and not scene.is_spatial:
-            reason = "expected more than 0 without [[joints]]: the machine moves in the plane"
-            raise Refusal(reason, ".length")
 
     def _check_design(self, before: tuple[Arm, ...]) -> None:
         """Refuse a design of no arm before it, or whose cells are not this arm's one by one."""

@@ -30,6 +30,7 @@ from pydantic import (
     model_validator,
 )
 
+from dolfinopt.data import tables_of
 from dolfinopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -96,13 +97,8 @@ def rows(tree: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
     return [row for row in (node if isinstance(node, list) else [node]) if isinstance(row, dict)]
 
 
-def setting(*given: Any, **rules: Any) -> Any:
-    """Return the field of a key: its default, if it has one, and what it means, with the unit.
-
-    Rules are those of pydantic, such as ge and le.
-    """
-    *default, description = given
-    return Field(*default, description=description, **rules)
+MEANINGS = tables_of("scene/keys.toml")  # of every table's keys, with the unit, by its class
+USES, DIMENSIONS = MEANINGS.pop("uses"), MEANINGS.pop("dimensions")
 
 
 class Use(NamedTuple):
@@ -111,17 +107,17 @@ class Use(NamedTuple):
     Attributes:
         keys: which, separated by spaces.
         choice: the other one.
-        values: of that, separated by spaces; "": any but none, false and 0.
+        values: of that; none: any but none, false and 0.
     """
 
     keys: str
     choice: str
-    values: str = ""
+    values: Sequence[str]
 
     @property
     def words(self) -> str:
         """Return e.g. 'used only with path = "arc"'."""
-        values = " or ".join(map(shown, self.values.split()))
+        values = " or ".join(map(shown, self.values))
         return f"used only with {self.choice}" + f" = {values}" * bool(values)
 
 
@@ -145,14 +141,22 @@ class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
 
     USES: ClassVar[tuple[Use, ...]] = ()
-    BY_DIMENSION: ClassVar[ByDimension] = ByDimension()
+    BY_DIMENSION: ClassVar[ByDimension]
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
-        """Put inherited keys behind a table's own; tell what keys are used with."""
+        """Put inherited keys behind a table's own; tell what keys mean and are used with."""
+        for key, meaning in MEANINGS.get(cls.__name__, {}).items():
+            cls.model_fields[key].description = meaning
         for key in [key for key in cls.model_fields if key not in cls.__annotations__]:
             cls.model_fields[key] = cls.model_fields.pop(key)
-        for use in cls.USES:
+        uses = [
+            Use(keys, choice, values)
+            for keys, (choice, *values) in USES.get(cls.__name__, {}).items()
+        ]
+        cls.USES = (*cls.USES, *uses)
+        cls.BY_DIMENSION = ByDimension(**DIMENSIONS.get(cls.__name__, {}))
+        for use in uses:
             for key in use.keys.split():
                 field = cls.model_fields[key]
                 meaning, _, unit = str(field.description).rpartition(" [")
@@ -235,7 +239,7 @@ class Table(BaseModel):
     def _check_uses(self) -> Self:
         for use in self.USES:
             choice = getattr(self, use.choice)
-            if choice in use.values.split() if use.values else choice:
+            if choice in use.values if use.values else choice:
                 continue
             reason = f"with {use.choice} = {shown(choice)}: it is {use.words}"
             if choice is None:

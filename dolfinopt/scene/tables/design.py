@@ -15,8 +15,6 @@ from dolfinopt.scene.tables.base import (
     Position,
     Refusal,
     Table,
-    Use,
-    setting,
 )
 
 if TYPE_CHECKING:
@@ -33,52 +31,17 @@ MEMBER_CELLS = 3  # in the width of the thinnest member: with fewer one cell mor
 class Design(Table):
     """Design variables x of all cells, their limits and their filter."""
 
-    USES = (
-        Use("sharpness continuation", "projection"),
-        Use("erosion minimum_member minimum_gap", "projection", "robust robust-eroded"),
-        Use("shared_volume", "volume_fraction"),
-    )
-
-    volume_fraction: float | None = setting(
-        0.5,
-        "upper limit of the volume fraction of each arm; where mass is objective or "
-        "limited: none unless stated [-]",
-        ge=1e-6,
-        le=1,
-    )
-    shared_volume: bool = setting(False, "one volume limit for all arms together [-]")
-    initial: float = setting(0.5, "initial x of every cell [-]", ge=1e-6, le=1)
-    minimum: float = setting(1e-3, "lower bound of x [-]", ge=1e-9, lt=1)
-    filter_radius: Extent = setting(
-        0.0075,
-        "radius of the equivalent cone filter; 0: no filter; default: an eighth of the "
-        "height of the lowest arm [m]",
-    )
-    projection: Projection = setting(
-        False,
-        "projection after the filter: none, Heaviside, or robust (eroded, nominal and dilated "
-        'designs together); limits hold for the nominal one, as it is meant, with "robust-eroded" '
-        "for every one of them [-]",
-    )
-    sharpness: float = setting(16.0, "final beta of the projection [-]", ge=1, le=1e4)
-    continuation: int = setting(
-        25, "number of iterations after which beta doubles [-]", ge=1, le=MAX_ITERATIONS
-    )
-    erosion: float = setting(
-        0.1,
-        "distance of the thresholds of the eroded and dilated designs from 0.5; with "
-        "a member and a gap of two widths that of the thinner one's [-]",
-        ge=1e-3,
-        le=0.499,
-    )
-    minimum_member: Extent = setting(
-        0.0,
-        "smallest width of members with the robust projection; sets the filter "
-        "radius (filter_radius stays at its default); 0: no limit, or minimum_gap [m]",
-    )
-    minimum_gap: Extent = setting(
-        0.0, "smallest width of gaps between members alike; 0: minimum_member [m]"
-    )
+    volume_fraction: float | None = Field(default=0.5, ge=1e-6, le=1)
+    shared_volume: bool = False
+    initial: float = Field(default=0.5, ge=1e-6, le=1)
+    minimum: float = Field(default=1e-3, ge=1e-9, lt=1)
+    filter_radius: Extent = 0.0075
+    projection: Projection = False
+    sharpness: float = Field(default=16.0, ge=1, le=1e4)
+    continuation: int = Field(default=25, ge=1, le=MAX_ITERATIONS)
+    erosion: float = Field(default=0.1, ge=1e-3, le=0.499)
+    minimum_member: Extent = 0.0
+    minimum_gap: Extent = 0.0
 
     @property
     def is_robust(self) -> bool:
@@ -287,20 +250,10 @@ BORDER = 1e-6
 class Region(Table):
     """A part of an arm that stays solid or void whatever the design."""
 
-    kind: RegionKind = setting("what the region stays: solid or void [-]")
-    box: tuple[Position, Position, Position, Position] | None = setting(
-        None,
-        "[x0, y0, x1, y1] in the arm's frame, x along from the inboard joint axis, y "
-        "across from the middle [m]",
-    )
-    circle: tuple[Position, Position, Length] | None = setting(
-        None, "[x, y, radius] of a disc in place of box [m]"
-    )
-    depth: tuple[Position, Position] | None = setting(
-        None,
-        "[z0, z1] over which it extends in a solid arm, z along the thickness from the "
-        "middle; default: through the whole thickness [m]",
-    )
+    kind: RegionKind
+    box: tuple[Position, Position, Position, Position] | None = None
+    circle: tuple[Position, Position, Length] | None = None
+    depth: tuple[Position, Position] | None = None
 
     def check_table(self) -> None:
         if (self.box is None) == (self.circle is None):
@@ -378,15 +331,9 @@ Law = Literal["two-material", "simp", "pedersen", "du-olhoff", "ramp"]
 class Interpolation(Table):
     """How stiffness and mass follow from the design variable x of a cell."""
 
-    law: Law = setting("two-material", "interpolation law of stiffness and mass [-]")
-    penalty: float = setting(3.0, 'exponent p of x in the stiffness; q of "ramp" [-]', ge=1, le=20)
-    floor: float = setting(
-        1e-6,
-        "stiffness and density of void relative to solid; laws other than "
-        '"two-material" use its square [-]',
-        ge=1e-12,
-        lt=1,
-    )
+    law: Law = "two-material"
+    penalty: float = Field(default=3.0, ge=1, le=20)
+    floor: float = Field(default=1e-6, ge=1e-12, lt=1)
 
 
 # -- `[optimizer]` -------------------------------------------------------------------------------
@@ -395,22 +342,10 @@ class Interpolation(Table):
 class Optimizer(Table):
     """When the optimiser stops and how far it moves at once."""
 
-    max_iterations: int = setting(
-        1000,
-        "largest number of design iterations; runs end by themselves before [-]",
-        ge=0,
-        le=MAX_ITERATIONS,
-    )
-    move: float = setting(0.2, "largest step of x in one iteration [-]", ge=1e-6, le=1)
-    tolerance: float = setting(
-        1e-3, "relative gain of the best design in 20 iterations that ends the run [-]", ge=0, le=1
-    )
-    kkt_tolerance: float = setting(
-        2e-2,
-        "Karush-Kuhn-Tucker residual up to which the certificate calls a design stationary [-]",
-        ge=0,
-        le=1e6,
-    )
+    max_iterations: int = Field(default=1000, ge=0, le=MAX_ITERATIONS)
+    move: float = Field(default=0.2, ge=1e-6, le=1)
+    tolerance: float = Field(default=1e-3, ge=0, le=1)
+    kkt_tolerance: float = Field(default=2e-2, ge=0, le=1e6)
 
 
 # -- [part]: what `dolfinopt part` makes of a result, unless its options say otherwise ----------
@@ -426,26 +361,11 @@ OptimizerSteps = Annotated[int, Field(ge=1, le=MAX_ITERATIONS)]
 class Part(Table):
     """Parts for the workshop."""
 
-    tool_radius: Extent | None = setting(
-        None, "least radius of concave corners; default: 0.003 [m]"
-    )
-    tolerance: Length | None = setting(
-        None, "how far sides may lie from the outline of the densities; default: a cell [m]"
-    )
-    minimum_member: Length | None = setting(
-        None, "smallest width of members of a part; default: design.minimum_member, or 0.001 [m]"
-    )
-    optimize: bool | OptimizerSteps = setting(
-        False,
-        "optimise the parts' free curves, too: the scene's objective within its limits; a number: "
-        "by as many steps from every start at most, true: 80 [-]",
-    )
-    starts: int = setting(
-        0,
-        "trusses that the curves start from besides the result of the densities [-]",
-        ge=0,
-        le=MAX_STARTS,
-    )
+    tool_radius: Extent | None = None
+    tolerance: Length | None = None
+    minimum_member: Length | None = None
+    optimize: bool | OptimizerSteps = False
+    starts: int = Field(default=0, ge=0, le=MAX_STARTS)
 
     @property
     def iterations(self) -> int:

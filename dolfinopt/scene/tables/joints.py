@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from dolfinopt.scene.tables.base import (
     Inertia,
@@ -18,8 +18,6 @@ from dolfinopt.scene.tables.base import (
     Stiffness,
     Table,
     Three,
-    Use,
-    setting,
     shown,
 )
 
@@ -56,26 +54,10 @@ def _check_name(name: str) -> str:
 class Interface(Table):
     """A rigid part of an arm's surface: one more, or the bore that is one of the arm's ends."""
 
-    name: Annotated[str, AfterValidator(_check_name)] = setting(
-        "unique name of the arm's interface, also that of its faces in a mesh file and "
-        'of its node in a SID file; "inboard" and "outboard" are the bores at the ends of a solid '
-        "arm with a mesh file: they place the arm's frame, wherever the file has the arm [-]"
-    )
-    point: Point = setting(
-        "its reference point in the arm's frame, of a bore the middle of its axis; "
-        'with an interface "inboard" in the mesh file\'s frame [m]'
-    )
-    radius: Length | None = setting(
-        None,
-        "of an arm made of cells: the sides of cells on its surface whose middle lies "
-        "within this distance of the point, each as a whole, are the interface; with axis, of the "
-        "bore [m]",
-    )
-    axis: Axis | None = setting(
-        None,
-        "of an arm with a mesh file: the interface is the bore of this radius about "
-        "the line through the point along this direction, of any length, in the point's frame [-]",
-    )
+    name: Annotated[str, AfterValidator(_check_name)]
+    point: Point
+    radius: Length | None = None
+    axis: Axis | None = None
 
     @property
     def is_end(self) -> str:
@@ -233,8 +215,6 @@ def in_frame(arm: Arm, point: Point) -> Point:
 # -- gear, motor, bearing and friction: keys that [[arms]] and [[joints]] share -------------------
 
 OUT_OF_PLANE = {2: "along z", 3: "about x", 4: "about y"}
-# What a joint has with another part alone.
-OF_PARTS = (Use("gear_damping", "gear_stiffness"), Use("friction_speed", "friction"))
 
 
 def _zero_for_inf(values: Any) -> Any:
@@ -247,47 +227,14 @@ def _zero_for_inf(values: Any) -> Any:
 class Drive(Table):
     """What drives and holds a joint; in the plane keys of [[arms]], in space of [[joints]]."""
 
-    rotor_inertia: Inertia = setting(
-        0.0,
-        "moment of inertia of the rotor that drives the joint, about its own axis, "
-        "which is the joint's; not part of joint_inertia [kg m2]",
-    )
-    gear_ratio: float | None = setting(
-        None,
-        "revolutions of the rotor per revolution of the joint, against what the joint "
-        "sits on; of a prismatic joint in space radians per metre; stated with rotor_inertia [-]",
-        ge=1e-3,
-        le=1e6,
-    )
-    gear_stiffness: Stiffness = setting(
-        0.0,
-        "stiffness of the gear between motor and joint, about or along the "
-        "joint's axis, as the joint feels it; 0: none, the joint follows the motor exactly "
-        "[N m/rad, N/m]",
-    )
-    gear_damping: Stiffness = setting(0.0, "damper beside gear_stiffness [N m s/rad, N s/m]")
-    bearing_stiffness: Annotated[Six[Stiffness] | None, BeforeValidator(_zero_for_inf)] = setting(
-        None,
-        "springs of the joint's bearing along x, y, z and about x, y, z of the "
-        "joint's frame, between what the joint sits on and the joint; 0 or inf: rigid in that "
-        "direction. In the plane along x, y and about z alone [N/m, N m/rad]",
-    )
-    bearing_damping: Six[Stiffness] | None = setting(
-        None, "dampers beside bearing_stiffness, in the same order [N s/m, N m s/rad]"
-    )
-    friction: tuple[Stiffness, Stiffness] | None = setting(
-        None,
-        "viscous coefficient f_v and Coulomb friction f_c at the motor, as the joint "
-        "feels them: f_v v + f_c tanh(v / friction_speed) against its speed v "
-        "[N m s/rad, N m; N s/m, N]",
-    )
-    friction_speed: float = setting(
-        0.02,
-        "speed at which Coulomb friction has 76 % of its value, which it tends to "
-        "like tanh [rad/s, m/s]",
-        ge=1e-6,
-        le=1e6,
-    )
+    rotor_inertia: Inertia = 0.0
+    gear_ratio: float | None = Field(default=None, ge=1e-3, le=1e6)
+    gear_stiffness: Stiffness = 0.0
+    gear_damping: Stiffness = 0.0
+    bearing_stiffness: Annotated[Six[Stiffness] | None, BeforeValidator(_zero_for_inf)] = None
+    bearing_damping: Six[Stiffness] | None = None
+    friction: tuple[Stiffness, Stiffness] | None = None
+    friction_speed: float = Field(default=0.02, ge=1e-6, le=1e6)
 
     def check_table(self) -> None:
         """Refuse dampers of a bearing in directions without a spring."""

@@ -1,51 +1,49 @@
-"""Joints, control, damping, payload, forces: what holds, moves and loads a machine."""
+"""Joints, closed loops, control, damping, payload, forces: what holds and moves a machine."""
 
 from __future__ import annotations
 
+import math
 from itertools import takewhile
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, field_validator
 
 from dolfinopt.scene.tables.arms import Tensor, check_arm_name, tensor_problem
 from dolfinopt.scene.tables.base import (
     Angle,
-    ByDimension,
     Component,
     DriveForce,
+    Duration,
     FileName,
     Inertia,
+    Instant,
+    Length,
     Position,
     Refusal,
     Stiffness,
     Table,
     Three,
     TwoOrThree,
-    Use,
     refuse_count,
-    setting,
     shown,
 )
 from dolfinopt.scene.tables.joints import (
-    DRIVE_KEYS,
-    OF_BEARINGS,
-    OF_PARTS,
+    Components,
     Drive,
     check_direction,
     check_site,
     check_used,
     joint_parts,
+    place_of,
     site_of,
 )
+from dolfinopt.scene.tables.responses import asked, need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 Direction = Annotated[Three[Component], AfterValidator(check_direction)]
-# What fixed joints do not have.
-OF_MOVING = ("axis", "passive", "position_limits", "velocity_limit", "effort_limit",
-             *(key for key in DRIVE_KEYS if key not in OF_BEARINGS))  # fmt: skip
 GROUND = "ground"
 PATHS = ("joints", "points", "line")  # of machines in space
 
@@ -60,49 +58,18 @@ def check_joint_name(name: str) -> str:
 class Joint(Drive):
     """A joint between the ground or an arm's outboard interface and the arm that it holds."""
 
-    USES = (Use(" ".join(OF_MOVING), "type", "revolute prismatic"), *OF_PARTS)
+    name: Annotated[str, AfterValidator(check_joint_name)]
+    type: JointType
+    parent: str
+    child: str
+    axis: Direction | None = None
+    origin: Three[Position] = (0.0, 0.0, 0.0)
+    rpy: Three[Angle] = (0.0, 0.0, 0.0)
+    passive: bool = False
 
-    name: Annotated[str, AfterValidator(check_joint_name)] = setting(
-        "unique name, the column of its coordinate in tables, of a rod without length of that [-]"
-    )
-    type: JointType = setting("what moves: an angle, a distance, or nothing [-]")
-    parent: str = setting(
-        'what it sits on: "arm" for its outboard interface, "arm.interface" for one of '
-        'arms.interfaces, or "ground" [-]'
-    )
-    child: str = setting("name of the arm that it holds, whose frame is the joint's [-]")
-    axis: Direction | None = setting(
-        None, "axis in the joint's frame, of any length; of revolute and prismatic ones [-]"
-    )
-    origin: Three[Position] = setting(
-        (0.0, 0.0, 0.0),
-        "origin of the joint's frame in the parent's interface frame, or in the world's [m]",
-    )
-    rpy: Three[Angle] = setting(
-        (0.0, 0.0, 0.0),
-        "roll, pitch and yaw about the fixed axes x, y and z that place the joint's "
-        "frame, as in URDF [rad]",
-    )
-    passive: bool = setting(
-        False, "whether it has no drive and follows from the others by [[closures]] [-]"
-    )
-
-    position_limits: tuple[Position, Position] | None = setting(
-        None,
-        "least and largest coordinate, as in URDF; a warning tells where the motion "
-        "exceeds them [rad, m]",
-    )
-    velocity_limit: DriveForce | None = setting(
-        None,
-        "largest rate of the coordinate either way, as in URDF; a warning tells where "
-        "the motion exceeds it [rad/s, m/s]",
-    )
-    effort_limit: DriveForce | None = setting(
-        None,
-        "largest torque or force of the drive either way, as in URDF; a warning tells "
-        "where the motion asks for more. The optimiser keeps control.limits and "
-        "constraints.peak_force [N m, N]",
-    )
+    position_limits: tuple[Position, Position] | None = None
+    velocity_limit: DriveForce | None = None
+    effort_limit: DriveForce | None = None
 
     @property
     def parent_arm(self) -> str:
@@ -144,12 +111,11 @@ class Joint(Drive):
                 )
         if len(before) == len(scene.joints) - 1:
             _check_tree(scene)
-            _check_passive(scene)
             _check_machine(scene)
 
 
 def _check_tree(scene: Scene) -> None:
-    """Refuse arms without a joint, and joints that do not lead to the ground."""
+    """Refuse arms without a joint, joints that do not lead to the ground or that nothing moves."""
     parents = {joint.child: joint.parent_arm for joint in scene.joints}
     for k, arm in enumerate(scene.arms):
         if arm.name == GROUND:
@@ -162,6 +128,9 @@ def _check_tree(scene: Scene) -> None:
                 "expected one of [[joints]] whose child it is", f"arms.{k}.name", "joints"
             )
     for i, joint in enumerate(scene.joints):
+        if not scene.closures:
+            reason = "without [[closures]]: no loop moves the joint"
+            joint.refuse_stated(f"joints.{i}.passive", reason)
         passed, above = [joint.child], joint.parent_arm
         while above != GROUND and above not in passed:
             passed.append(above)
@@ -174,13 +143,6 @@ def _check_tree(scene: Scene) -> None:
             )
     if not any(joint.moves for joint in scene.joints):
         raise Refusal('expected a "revolute" or "prismatic" joint: nothing moves', "joints.0.type")
-
-
-def _check_passive(scene: Scene) -> None:
-    """Refuse joints without drives where no loop moves them."""
-    for i, joint in enumerate(scene.joints if not scene.closures else ()):
-        reason = "without [[closures]]: no loop moves the joint"
-        joint.refuse_stated(f"joints.{i}.passive", reason)
 
 
 def _check_machine(scene: Scene) -> None:
@@ -209,39 +171,202 @@ def _check_machine(scene: Scene) -> None:
             )
 
 
+# -- `[[closures]]`: joints that close loops between arms, or with the ground ---------------------
+
+Line = tuple[Component, Component]
+ClosureKind = Literal["ball", "pin", "slider", "universal", "rod"]
+# Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
+OF_THE_END = ("deviation", "settling")
+# What is positive of every equation's force and moment, in the joint's frame; in the plane and in
+# space.
+Names = tuple[str, ...]
+IN_PLANE: dict[str, tuple[Names, Names]] = {"pin": (("x", "y"), ()), "slider": (("normal",), ())}
+IN_SPACE: dict[str, tuple[Names, Names]] = {
+    "ball": (("x", "y", "z"), ()),
+    "pin": (("x", "y", "z"), ("moment_1", "moment_2")),
+    "slider": (("force_1", "force_2"), ("moment_1", "moment_2", "moment_3")),
+    "universal": (("x", "y", "z"), ("moment",)),
+    "rod": (("",), ()),
+}
+
+
+class Closures(Table):
+    """A joint between an arm's interface and another one or the ground that closes a loop."""
+
+    name: Annotated[str, AfterValidator(check_joint_name)]
+    kind: ClosureKind
+    between: tuple[str, str]
+    point: TwoOrThree[Position] = (0.0, 0.0, 0.0)
+    rpy: Three[Angle] = (0.0, 0.0, 0.0)
+    axis: Line | Three[Component] | None = None
+    cross_axis: Direction | None = None
+    length: Length | None = None
+    stiffness: Stiffness = 0.0
+    damping: Stiffness = 0.0
+
+    @property
+    def driven(self) -> bool:
+        """Whether it is a rod whose length is prescribed."""
+        return self.kind == "rod" and self.length is None
+
+    @property
+    def is_spring(self) -> bool:
+        """Whether it is a rod that gives way."""
+        return self.stiffness > 0.0
+
+    def parts(self, dimension: int) -> tuple[tuple[str, str], ...]:
+        """Return what is positive of every equation's force, in the joint's frame, and its unit."""
+        forces, moments = (IN_SPACE if dimension == 3 else IN_PLANE)[self.kind]
+        return *((name, "N") for name in forces), *((name, "N m") for name in moments)
+
+    @field_validator("axis")
+    @classmethod
+    def _check_axis(cls, axis: Components | None) -> Components | None:
+        return axis if axis is None else check_direction(axis)
+
+    def check_table(self) -> None:
+        needed = {"slider": ("axis",), "universal": ("axis", "cross_axis")}
+        for key in needed.get(self.kind, ()):
+            if getattr(self, key) is None:
+                reason = f"expected an array of three numbers with a {self.kind}"
+                raise Refusal(reason, key, "kind")
+        if self.kind == "universal":
+            self._check_cross()
+
+    def _check_cross(self) -> None:
+        assert self.axis is not None and self.cross_axis is not None
+        along = sum(a * b for a, b in zip(self.axis, self.cross_axis, strict=False))
+        if abs(along) > 1e-6 * math.hypot(*self.axis) * math.hypot(*self.cross_axis):
+            raise Refusal("expected a direction across closures.axis", "cross_axis", "axis")
+
+    def check_in_scene(self, scene: Scene) -> None:
+        """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
+        if self.name.casefold() in [joint.name.casefold() for joint in scene.joints]:
+            raise Refusal("expected a name that no joint or other closure has", ".name")
+        self._check_ends(scene)
+        if scene.is_spatial:
+            self._check_in_space(scene)
+        else:
+            self._check_in_plane(scene)
+
+    def _check_in_space(self, scene: Scene) -> None:
+        """Refuse what a loop in space cannot be combined with."""
+        if self.kind == "pin" and self.axis is None:
+            raise Refusal("expected an array of three numbers with a pin", ".axis")
+        if self.axis is not None and len(self.axis) == 2:
+            raise Refusal("expected an array of three numbers with [[joints]]", ".axis")
+        if self.is_spring and scene.control is not None:
+            raise Refusal(
+                "expected 0 with [control]: a driven rod has its drive's gains there",
+                ".stiffness",
+                "control",
+            )
+        if need_of(scene, "eigenproblem") and scene.objective.attached != "none":
+            raise Refusal(
+                'expected "none" with [[closures]]: what a link carries through a loop does not '
+                "vibrate with it; take a response of the motion, or links that carry nothing",
+                "objective.attached",
+                ".kind",
+            )
+        if not scene.driven:
+            raise Refusal(
+                "expected a joint without passive = true, or a rod without length: nothing is "
+                "driven",
+                "joints.0.passive",
+                ".kind",
+            )
+
+    def _check_in_plane(self, scene: Scene) -> None:
+        """Refuse all but one pin or slider at the chain's end, and what it rules out."""
+        ends = [place_of(scene, end) for end in self.between]
+        alone = ends == [(len(scene.arms) - 1, 0), None] and len(scene.closures) == 1
+        if not alone or self.kind not in IN_PLANE or any(self.rpy):
+            raise Refusal(
+                "expected one pin or slider between the last arm and the ground without "
+                "[[joints]]: more is closed in space, with [[joints]] about the plane's normal",
+                ".kind",
+                "arms",
+            )
+        if any(self.point[2:]):
+            raise Refusal("expected an array of two numbers without [[joints]]", ".point")
+        axis = self.axis or (0.0, 0.0, 1.0)
+        if any(axis[:2] if self.kind == "pin" else axis[2:]):
+            expected = "[0, 0, 1], the default" if self.kind == "pin" else "two numbers"
+            raise Refusal(f"expected {expected}, without [[joints]]", ".axis")
+        if len(scene.arms) <= scene.dependent_joints:
+            raise Refusal(
+                f'expected kind = "{self.kind}" with at least {scene.dependent_joints + 1} arms, '
+                f"found {len(scene.arms)}",
+                ".kind",
+                "arms",
+            )
+        if not scene.motion.is_fixed:
+            raise Refusal('expected "fixed" with [[closures]]', "motion.base", ".kind")
+        if scene.motion.path not in ("rotation", "joints"):
+            raise Refusal(
+                'expected "rotation" or "joints" with [[closures]] without [[joints]]: the motion '
+                "prescribes the joints that are independent",
+                "motion.path",
+                ".kind",
+            )
+        self._check_springs(scene)
+        if self.kind == "pin":
+            self._check_pin(scene)
+
+    def _check_springs(self, scene: Scene) -> None:
+        """Refuse springs between drive and arm at joints of the plane that have no drive."""
+        first = len(scene.arms) - scene.dependent_joints
+        for index, arm in enumerate(scene.arms):
+            if index >= first and arm.gear_stiffness > 0.0:
+                raise Refusal(
+                    f"expected 0: the joint of {arm.name} follows from the others in the closed "
+                    "loop and has no drive",
+                    f"arms.{index}.gear_stiffness",
+                    ".kind",
+                )
+            if arm.bearing_stiffness is not None:
+                raise Refusal(
+                    "expected none with [[closures]] without [[joints]]: state [[joints]] about "
+                    "the plane's normal, or leave it out",
+                    f"arms.{index}.bearing_stiffness",
+                    ".kind",
+                )
+
+    def _check_pin(self, scene: Scene) -> None:
+        """Refuse responses of the deviation of an end that a pin holds, and forces along a line."""
+        for n, force in enumerate(scene.forces):
+            if force.name == "closure":
+                reason = "expected 0.0, the default, with a pin: its end does not move"
+                raise Refusal(reason, f"forces.{n}.factor", ".kind")
+        for key in set(OF_THE_END).intersection(response.name for response in asked(scene)):
+            place = "objective.kind" if scene.objective.kind == key else f"constraints.{key}"
+            raise Refusal(
+                "expected another response with a pin: the end of the last arm is held, it "
+                "deviates from nothing; take the compliance",
+                place,
+                ".kind",
+            )
+
+    def _check_ends(self, scene: Scene) -> None:
+        check_site(scene, self.between[0], ".between")
+        check_site(scene, self.between[1], ".between", (GROUND,))
+        if site_of(self.between[0])[0] == site_of(self.between[1])[0]:
+            raise Refusal("expected interfaces of two arms", ".between")
+
+
 # -- `[control]` ---------------------------------------------------------------------------------
 
-FeedForward = Literal["rigid", "elastic", "tip", "none"]
+Known = Literal["rigid", "elastic", "tip", "none"]
 
 
 class Control(Table):
     """Feed-forward and feedback that drive the rigid coordinates instead of prescribing them."""
 
-    feed_forward: FeedForward = setting(
-        "rigid",
-        "forces known in advance: inverse dynamics of the machine with rigid arms of "
-        'the current design, its rotors and friction included; "elastic" also asks motors behind '
-        "gear_stiffness to turn ahead of their joints by what the gears give; "
-        '"tip": those of [feed_forward], with its joints as desired ones; or none [-]',
-    )
-    stiffness: tuple[Stiffness, ...] = setting(
-        "proportional gain of every driven coordinate, the cart first, then the joints "
-        "from the base outwards [N/m, N m/rad]"
-    )
-    damping: tuple[Stiffness, ...] = setting(
-        "derivative gain of every driven coordinate [N s/m, N m s/rad]"
-    )
-    limits: tuple[DriveForce, ...] | None = setting(
-        None,
-        "largest force of every drive: up to 95 % of its limit a drive gives what the "
-        "control asks for, from 105 % on the limit, with a smooth transition between them "
-        "(three times continuously differentiable); default: none [N, N m]",
-    )
-    forces: FileName | None = setting(
-        None,
-        "table (CSV) of forces that are added, with columns t, cart and the arms' "
-        "names; zero behind its last row [N, N m]",
-    )
+    feed_forward: Known = "rigid"
+    stiffness: tuple[Stiffness, ...]
+    damping: tuple[Stiffness, ...]
+    limits: tuple[DriveForce, ...] | None = None
+    forces: FileName | None = None
 
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse gains and limits that are not one for every driven coordinate."""
@@ -258,15 +383,57 @@ class Control(Table):
             refuse_count(getattr(self, key), scene.driven, f".{key}")
 
 
+# -- `[feed_forward]`: joint motions under which the bending arms carry the tip along its path ---
+
+LEAD_SHARE = 0.05  # of the motion's duration: pre-actuation fades within milliseconds
+
+
+class FeedForward(Table):
+    """Corrections of joints that keep the tip of the flexible machine on the rigid one's path."""
+
+    kind: Literal["none", "tip"] = "none"
+    joints: tuple[str, ...] | None = None
+    spacing: Duration | None = None
+    lead: Instant | None = None
+
+    @property
+    def on(self) -> bool:
+        """Whether joints are corrected."""
+        return self.kind != "none"
+
+    def check_in_scene(self, scene: Scene) -> None:
+        """Refuse what nothing uses, joints that are no drives, and motions without a free tip."""
+        if not self.on:
+            return
+        if scene.control is not None and scene.control.feed_forward != "tip":
+            raise Refusal(
+                'expected "none" with [control], unless control.feed_forward = "tip"',
+                ".kind",
+                "control.feed_forward",
+            )
+        if scene.is_pinned:
+            raise Refusal(
+                'expected "none": a pin holds the end-effector, which has no path', ".kind"
+            )
+        if scene.motion.table_ends == "moving":
+            raise Refusal(
+                'expected "rest" with feed_forward.kind = "tip", whose corrections begin at rest',
+                "motion.table_ends",
+                ".kind",
+            )
+        for name in self.joints or ():
+            if name not in scene.driven:
+                known = ", ".join(scene.driven)
+                raise Refusal(f"expected drives, of {known}; {shown(name)} is none", ".joints")
+
+
 # -- `[damping]` ---------------------------------------------------------------------------------
 
 
 class Damping(Table):
     """Structural damping D = stiffness_proportional * K."""
 
-    stiffness_proportional: float = setting(
-        2e-4, "factor d of the damping matrix D = d K [s]", ge=0, le=1e3
-    )
+    stiffness_proportional: float = Field(default=2e-4, ge=0, le=1e3)
 
 
 # -- `[payload]` ---------------------------------------------------------------------------------
@@ -275,21 +442,10 @@ class Damping(Table):
 class Payload(Table):
     """What the end-effector carries."""
 
-    BY_DIMENSION = ByDimension(in_space="offset arm", numbers="inertia")
-    mass: Inertia = setting("point mass at the end-effector [kg]")
-    inertia: Inertia | Tensor = setting(
-        0.0,
-        "moment of inertia about its centre; in space about every axis, or the tensor "
-        "xx, yy, zz, xy, xz, yz [kg m2]",
-    )
-    offset: Three[Position] = setting(
-        (0.0, 0.0, 0.0), "its centre in the frame of the end-effector's interface; in space [m]"
-    )
-    arm: str | None = setting(
-        None,
-        '"arm" or "arm.interface" that carries it and is the end-effector, whose '
-        "deviation and path count; default: the last one; in space [-]",
-    )
+    mass: Inertia
+    inertia: Inertia | Tensor = 0.0
+    offset: Three[Position] = (0.0, 0.0, 0.0)
+    arm: str | None = None
 
     @property
     def moment(self) -> float:
@@ -320,34 +476,14 @@ FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 class Force(Table):
     """A force and a moment on an interface of an arm, constant or from a table over time."""
 
-    BY_DIMENSION = ByDimension(numbers="moment", vectors="force")
-    name: Annotated[str, AfterValidator(check_joint_name)] | None = setting(
-        None, "unique name, by which changes may call it [-]"
-    )
-    arm: str = setting('what it acts on: "arm" for its outboard interface, or "arm.interface" [-]')
-    force: Vector | None = setting(
-        None, "constant force on the interface's point: x, y, in space x, y, z [N]"
-    )
-    moment: GivenMoment | None = setting(
-        None, "constant moment: in the plane a number, in space about x, y, z [N m]"
-    )
-    table: FileName | None = setting(
-        None,
-        "table (CSV) over time, added to force and moment, with columns t, fx, fy, mz, "
-        "in space t, fx, fy, fz, mx, my, mz; straight between its rows, zero behind the last "
-        "[s, N, N m]",
-    )
-    factor: float = setting(
-        1.0, "factor on force, moment and table, to be varied in studies [-]", ge=-1e12, le=1e12
-    )
-    frame: ForceFrame = setting(
-        "world",
-        "whose directions x, y, z are: the world's, or the arm's, whose x leads from "
-        "the inboard joint to the undeformed outboard one [-]",
-    )
-    feed_forward: bool = setting(
-        True, "the feed-forward of [control] knows it; false: a disturbance [-]"
-    )
+    name: Annotated[str, AfterValidator(check_joint_name)] | None = None
+    arm: str
+    force: Vector | None = None
+    moment: GivenMoment | None = None
+    table: FileName | None = None
+    factor: float = Field(default=1.0, ge=-1e12, le=1e12)
+    frame: ForceFrame = "world"
+    feed_forward: bool = True
 
     def check_table(self) -> None:
         if self.force is None and self.moment is None and self.table is None:

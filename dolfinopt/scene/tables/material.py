@@ -16,7 +16,6 @@ from dolfinopt.scene.tables.base import (
     Table,
     Three,
     TwoOrThree,
-    setting,
     shown,
 )
 
@@ -93,39 +92,14 @@ class Material(Table):
     `name = "NAME"` in it, for those that are not stated.
     """
 
-    name: CatalogueName | None = setting(
-        None,
-        'name in the catalogue, e.g. "aluminium 7075-T6", from which values not stated '
-        'are taken; material = "NAME" in place of the table is short for it [-]',
-    )
-    kind: Literal["isotropic", "orthotropic"] = setting(
-        "isotropic",
-        'material law; "orthotropic" has directions 1, 2, 3: the arm\'s x, y, z turned '
-        "by angle [-]",
-    )
-    young_modulus: YoungModuli = setting(
-        "Young's modulus of the solid material; orthotropic [E1, E2] or [E1, E2, E3], "
-        "E3 = E2 by default [Pa]"
-    )
-    poisson_ratio: PoissonRatios = setting(
-        "Poisson's ratio; orthotropic nu12, contraction along 2 by tension along 1, in "
-        "space of all three pairs, or [nu12, nu23, nu13] [-]"
-    )
-    shear_modulus: ShearModuli | None = setting(
-        None,
-        "shear modulus of an orthotropic material: G12, in space of all three planes, "
-        "or [G12, G23, G13] [Pa]",
-    )
-    angle: FibreAngle | Three[FibreAngle] | None = setting(
-        None,
-        "angle of direction 1 from the arm's axis, from x towards y, in the wall of a "
-        "hollow arm as seen from outside; of a solid arm also roll, pitch and yaw of the "
-        "directions, as of [[joints]]; default: 0 [rad]",
-    )
-    density: MassDensity = setting("mass density of the solid material [kg/m3]")
-    yield_strength: YieldStrength | None = setting(
-        None, "stress up to which the solid material is elastic; for reports alone [Pa]"
-    )
+    name: CatalogueName | None = None
+    kind: Literal["isotropic", "orthotropic"] = "isotropic"
+    young_modulus: YoungModuli
+    poisson_ratio: PoissonRatios
+    shear_modulus: ShearModuli | None = None
+    angle: FibreAngle | Three[FibreAngle] | None = None
+    density: MassDensity
+    yield_strength: YieldStrength | None = None
 
     @property
     def law(self) -> LawDeclaration:

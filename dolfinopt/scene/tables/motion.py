@@ -9,7 +9,6 @@ from pydantic import Field
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import (
     Angle,
-    ByDimension,
     Duration,
     FileName,
     Frequency,
@@ -21,9 +20,7 @@ from dolfinopt.scene.tables.base import (
     Table,
     Three,
     TwoOrThree,
-    Use,
     refuse_count,
-    setting,
     shown,
 )
 
@@ -49,133 +46,31 @@ PROFILES = ("trapezoidal", "s-curve")  # laws that are shaped by the limits
 class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
 
-    BY_DIMENSION = ByDimension(
-        in_plane="base cart_follow cart_mass joint_height elbow",
-        in_space="rpy",
-        vectors="gravity start end",
-    )
-    USES = (
-        Use("radius flattening", "path", "arc"),
-        Use("start end rpy", "path", "line"),
-        Use("initial_joints", "path", "line points joints rotation"),
-        Use("file table_ends", "path", "points joints"),
-        Use("speed", "path", "rotation"),
-        Use("cart_follow max_speed max_acceleration max_jerk", "path", "arc line points"),
-        Use("cart_follow cart_mass", "base", "cart"),
-        Use("acceleration_share", "law", "trapezoidal s-curve"),
-        Use("max_jerk", "law", "quintic septic s-curve"),
-    )
-
-    path: PathKind = setting(
-        "path of the end-effector (arc, line, table of points), a table of joint "
-        "coordinates, or a first joint that runs up to constant speed [-]"
-    )
-    radius: Length = setting(
-        1.0,
-        "radius of the arc, a semicircle about the origin; default: half the length of "
-        "all arms [m]",
-    )
-    flattening: float = setting(
-        1.0, "factor on the y coordinate of the arc; 0 gives a straight line [-]", ge=0, le=1
-    )
-    start: Point = setting((-1.0, 0.0), "start point of the line; in space three numbers [m]")
-    end: Point = setting((1.0, 0.0), "end point of the line; in space three numbers [m]")
-    rpy: Three[Angle] | None = setting(
-        None,
-        "orientation of the end-effector along a line in space: roll, pitch and yaw "
-        "about the world's axes x, y and z; default: free [rad]",
-    )
-    initial_joints: tuple[Position, ...] | None = setting(
-        None,
-        "joint coordinates near those at the start of an end-effector's path in "
-        "space, or of closed loops, for [[joints]] that move, in the plane for all arms: which "
-        "solution is meant; of a rotation the first one is its joint's at the start, and the "
-        "others may be left out; default: 0, in the plane by elbow [rad, m]",
-    )
-    file: FileName | None = setting(
-        None,
-        "table (CSV) of points or joint coordinates; relative to the scene's folder "
-        "or the working directory [-]",
-    )
-    speed: float = setting(
-        10.0,
-        "angular velocity of the first joint after motion.duration, which the law "
-        "gives it; path rotation [rad/s]",
-        ge=-1e6,
-        le=1e6,
-    )
-    law: TimeLaw = setting(
-        "quintic",
-        "time law along the path; for a table with times, of every move between two stops [-]",
-    )
-    shape: ShapeCount | tuple[Coefficient, ...] = setting(
-        0,
-        "how many coefficients of the law optimize chooses beside the densities, at "
-        "most 8, or their values, shares of the way [-]",
-    )
-    acceleration_share: float = setting(
-        0.25,
-        'fraction of the duration in which "trapezoidal" and "s-curve" accelerate, '
-        "and the same in which they brake; unused if the last of their limits "
-        "(max_acceleration, max_jerk) is given [-]",
-        ge=1e-3,
-        le=0.5,
-    )
-    max_speed: PathLimit | None = setting(
-        None,
-        "limit of the speed along the path; of a law with variables (shape) a constraint [m/s]",
-    )
-    max_acceleration: PathLimit | None = setting(
-        None, "limit of the acceleration along the path, alike [m/s2]"
-    )
-    max_jerk: PathLimit | None = setting(
-        None, 'limit of the jerk along the path, alike; not with "trapezoidal" [m/s3]'
-    )
-    duration: Duration = setting(
-        1.9,
-        "time from start to end of the path; where a table has times or limits are "
-        "given, the default is the last time or the shortest possible [s]",
-    )
-    horizon: Duration = setting(
-        3.0,
-        "simulated time, at least the duration, after which the machine stays at "
-        "rest or keeps its speed; the default is the duration if that is longer [s]",
-    )
-    table_ends: Literal["rest", "moving"] = setting(
-        "rest",
-        "whether a table with times rests at its first and last instant, or moves "
-        "there at the rates of its own rows, as one cut out of a motion does [-]",
-    )
-    dwells: bool | tuple[tuple[Instant, Instant], ...] = setting(
-        True,
-        "further rest intervals for settling: true, every stop of the path; false, "
-        "none; or a list of [start, end] [s]",
-    )
-    base: Base = setting(
-        "cart",
-        'what carries the shoulder joint: "cart"; "fixed", at x = 0; or the x of a fixed base [m]',
-    )
-    cart_follow: float = setting(
-        0.5,
-        "cart's position over the end-effector's desired x; not with one arm, a "
-        "fixed base or a table of joint coordinates [-]",
-        ge=-1e3,
-        le=1e3,
-    )
-    cart_mass: Inertia = setting(0.0, "mass of the cart [kg]")
-    joint_height: Position = setting(
-        -0.5, "y of the shoulder joint; default: a quarter of the length of all arms below 0 [m]"
-    )
-    elbow: Literal[-1, 1] = setting(
-        -1,
-        "which of two ways: sign of the elbow angle beta, with one arm of the cosine of its angle; "
-        "of a closed loop in the plane that of the last joint's angle at the start, where that is "
-        "zero the stretched way, unless initial_joints says it; default of a loop: 1 [-]",
-    )
-    gravity: Gravity = setting(
-        (0.0, 0.0),
-        "gravitational acceleration in x and y; in space, with [[joints]], in x, y and z [m/s2]",
-    )
+    path: PathKind
+    radius: Length = 1.0
+    flattening: float = Field(default=1.0, ge=0, le=1)
+    start: Point = (-1.0, 0.0)
+    end: Point = (1.0, 0.0)
+    rpy: Three[Angle] | None = None
+    initial_joints: tuple[Position, ...] | None = None
+    file: FileName | None = None
+    speed: float = Field(default=10.0, ge=-1e6, le=1e6)
+    law: TimeLaw = "quintic"
+    shape: ShapeCount | tuple[Coefficient, ...] = 0
+    acceleration_share: float = Field(default=0.25, ge=1e-3, le=0.5)
+    max_speed: PathLimit | None = None
+    max_acceleration: PathLimit | None = None
+    max_jerk: PathLimit | None = None
+    duration: Duration = 1.9
+    horizon: Duration = 3.0
+    table_ends: Literal["rest", "moving"] = "rest"
+    dwells: bool | tuple[tuple[Instant, Instant], ...] = True
+    base: Base = "cart"
+    cart_follow: float = Field(default=0.5, ge=-1e3, le=1e3)
+    cart_mass: Inertia = 0.0
+    joint_height: Position = -0.5
+    elbow: Literal[-1, 1] = -1
+    gravity: Gravity = (0.0, 0.0)
 
     def check_table(self) -> None:
         tabulated = self.path in ("points", "joints")
@@ -359,21 +254,9 @@ MAX_SAMPLES = 10_000_000  # output instants; more would not fit the memory of a 
 class Simulation(Table):
     """Time integration of the elastic coordinates and its output."""
 
-    tolerance: float = setting(
-        1e-4, "relative error allowed in the elastic coordinates [-]", ge=1e-12, le=0.1
-    )
-    stiffening: bool | Literal["auto"] = setting(
-        "auto",
-        "geometric stiffening by the arms' own stress: true, false, or where the "
-        "loads change an arm's stiffness by 0.25 % [-]",
-    )
-    sample: float = setting(
-        1e-3,
-        "interval of the instants in trajectory.npz and trajectory.csv; no result "
-        "depends on it [s]",
-        ge=1e-9,
-        le=1e5,
-    )
+    tolerance: float = Field(default=1e-4, ge=1e-12, le=0.1)
+    stiffening: bool | Literal["auto"] = "auto"
+    sample: float = Field(default=1e-3, ge=1e-9, le=1e5)
 
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse an interval longer than the horizon, or too short for the memory."""
@@ -397,20 +280,9 @@ Coordinates = Annotated[int, Field(ge=1)] | ReductionError | Literal["auto"]
 class Reduction(Table):
     """Model reduction of every arm."""
 
-    USES = (Use("frequencies", "method", "krylov balanced"),)
-
-    method: ReductionMethod = setting("craig-bampton", "method of model reduction [-]")
-    coordinates: Coordinates = setting(
-        4,
-        "number of elastic coordinates q of each arm; or the relative error of the reduction, "
-        'energy norm, which the smallest number meets, "auto" being 0.001; default in space: 6 for '
-        "each outboard interface [-]",
-    )
-    frequencies: tuple[Frequency, ...] | None = setting(
-        None,
-        'frequencies at which "krylov" matches moments, by default 0; least and '
-        'largest one whose responses "balanced" weights, by default 0 and 50 [Hz]',
-    )
+    method: ReductionMethod = "craig-bampton"
+    coordinates: Coordinates = 4
+    frequencies: tuple[Frequency, ...] | None = None
 
     @property
     def shifts(self) -> tuple[float, ...]:

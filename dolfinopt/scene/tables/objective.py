@@ -10,7 +10,6 @@ from pydantic.fields import FieldInfo
 
 from dolfinopt.scene.tables.base import (
     Angle,
-    ByDimension,
     Extent,
     Instant,
     Refusal,
@@ -18,7 +17,6 @@ from dolfinopt.scene.tables.base import (
     Table,
     Three,
     refuse_count,
-    setting,
     shown,
 )
 from dolfinopt.scene.tables.responses import (
@@ -64,77 +62,19 @@ Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 class Objective(Table):
     """What is minimised."""
 
-    BY_DIMENSION = ByDimension(in_plane="elbow_angle")
-
-    kind: ObjectiveKind = setting(
-        "esl",
-        'minimised response, "esl" being the compliance of the load cases; or '
-        "frequency, maximised [-]",
-    )
-    direction: Direction | None = setting(
-        None,
-        "minimize or maximize the response; default: maximize frequencies, minimize "
-        "everything else [-]",
-    )
-    load_cases: int = setting(
-        30,
-        "number of load cases: the worst instant of each of so many equal intervals "
-        "of the horizon [-]",
-        ge=1,
-    )
-    gradient: GradientKind = setting(
-        "exact",
-        '"exact": of the whole simulation, as it always is of drive forces; "esl": '
-        'equivalent static loads held constant, the default with kind = "esl" if no limit under '
-        "[constraints] follows the motion [-]",
-    )
-    exponent: float = setting(
-        20.0,
-        "exponent p of the p-means that stand for extremes: over time, modes, load "
-        "cases, scenarios, robust designs [-]",
-        ge=2,
-        le=200,
-    )
-    stress_exponent: float = setting(
-        4.0,
-        "exponent p of the p-mean of the stress over cells and instants; with larger "
-        "ones cells come and go as the largest, and steps must be small [-]",
-        ge=2,
-        le=100,
-    )
-    stress_margin: Extent = setting(
-        0.0,
-        "cells closer than this to an interface do not count for the stress: at the "
-        "corners of a clamped edge it grows without bound as cells shrink [m]",
-    )
-    scenarios: Combination = setting(
-        "sum", "how scenarios are combined in the objective: weighted sum, or smooth maximum [-]"
-    )
-    loads: tuple[Load | SpatialLoad, ...] = setting(
-        ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-        "static load cases [F_x N, F_y N, moment N m] at each arm's outboard "
-        "interface; of solids force and moment of three components each, by default unit forces "
-        "along y and z and a unit moment about x [-]",
-    )
-    effort_weights: tuple[Weight, ...] | None = setting(
-        None,
-        "what the force of every drive is multiplied by in effort and peak_force, the "
-        "cart's first, then the joints' from the base outwards: the reciprocals of the drives' "
-        "rated forces; default: 1 each [1/N, 1/(N m)]",
-    )
-    attached: Attached = setting(
-        "rigid-body", "model of what an arm carries, for its eigenfrequencies [-]"
-    )
-    elbow_angle: Angle | None = setting(
-        None,
-        "angle of every joint outboard of an arm, for its eigenfrequencies; "
-        "default: that at the middle of the path [rad]",
-    )
-    modes: ModeCount | Literal["first"] = setting(
-        3,
-        'number of lowest modes in the p-mean of the eigenfrequency; "first": as objective the '
-        "initial design's first mode alone, tracked by its MAC value [-]",
-    )
+    kind: ObjectiveKind = "esl"
+    direction: Direction | None = None
+    load_cases: int = Field(default=30, ge=1)
+    gradient: GradientKind = "exact"
+    exponent: float = Field(default=20.0, ge=2, le=200)
+    stress_exponent: float = Field(default=4.0, ge=2, le=100)
+    stress_margin: Extent = 0.0
+    scenarios: Combination = "sum"
+    loads: tuple[Load | SpatialLoad, ...] = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    effort_weights: tuple[Weight, ...] | None = None
+    attached: Attached = "rigid-body"
+    elbow_angle: Angle | None = None
+    modes: ModeCount | Literal["first"] = 3
 
     @property
     def follow(self) -> bool:
@@ -178,7 +118,10 @@ class Objective(Table):
             raise Refusal("expected a number above 0 for one drive at least", ".effort_weights")
         self._check_unused(scene)
         self._check_attached(scene)
-        self._check_static(scene)
+        count = 6 if scene.is_spatial else 3
+        if any(len(load) != count for load in self.static_loads(scene)):
+            what = "six numbers, force and moment, with" if count == 6 else "three numbers without"
+            raise Refusal(f"expected arrays of {what} [[joints]]", "objective.loads")
         self._check_load_cases(scene)
         self._check_lightest(scene)
         if not need_of(scene, "motion"):
@@ -231,13 +174,6 @@ class Objective(Table):
         default = type(self).model_fields["loads"].default
         return SPATIAL_LOADS if scene.is_spatial and self.loads == default else self.loads
 
-    def _check_static(self, scene: Scene) -> None:
-        """Refuse loads of arms in the plane on solids, and the other way round."""
-        count = 6 if scene.is_spatial else 3
-        if any(len(load) != count for load in self.static_loads(scene)):
-            what = "six numbers, force and moment, with" if count == 6 else "three numbers without"
-            raise Refusal(f"expected arrays of {what} [[joints]]", "objective.loads")
-
     def _check_load_cases(self, scene: Scene) -> None:
         horizon = scene.motion.horizon
         most = max(MANY_CASES, int(1e3 * horizon * (1.0 + 1e-9)))
@@ -283,12 +219,8 @@ Limit = float | tuple[float | None, ...] | tuple[StiffnessCase, ...]
 class ConstraintOptions(Table):
     """Options of limits."""
 
-    settling_after: Instant = setting(
-        0.0, "time from the beginning of each rest after which settling counts [s]"
-    )
-    poles_at: tuple[Instant, ...] | None = setting(
-        None, "instants at which poles count; default: start, middle and end of the motion [s]"
-    )
+    settling_after: Instant = 0.0
+    poles_at: tuple[Instant, ...] | None = None
 
     @property
     def limits(self) -> dict[str, Limit]:
@@ -434,11 +366,8 @@ TABLES = ("motion", "control", "closures", "payload", "forces", "damping", "mate
 class Scenario(Table):
     """A scenario: another use of the same design, part of the objective."""
 
-    changes: tuple[str, ...] = setting(
-        'changes to the scene as "key=value", of motion, control, closures, payload, '
-        "forces, damping or material [-]"
-    )
-    weight: float = setting(1.0, "weight in the sum of the scenarios [-]", ge=1e-9, le=1e9)
+    changes: tuple[str, ...]
+    weight: float = Field(default=1.0, ge=1e-9, le=1e9)
 
     @field_validator("changes")
     @classmethod

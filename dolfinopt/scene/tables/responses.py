@@ -10,20 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
+from dolfinopt.data import tables_of
 from dolfinopt.scene.tables.base import (
     DriveForce,
     Refusal,
     Table,
     Three,
     TwoOrThree,
-    setting,
 )
-from dolfinopt.scene.toml import tomllib
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
@@ -45,20 +43,11 @@ Component = Annotated[float, Field(ge=-LARGEST_LOAD, le=LARGEST_LOAD)]  # N, N m
 class StiffnessCase(Table):
     """A static load on one arm, and how far it may move the arm's outboard interface."""
 
-    arm: str = setting("name of the arm, which is clamped at its inboard interface [-]")
-    force: TwoOrThree[Component] | None = setting(
-        None,
-        "force at the outboard interface in the arm's frame: two components, three of a solid [N]",
-    )
-    moment: Component | Three[Component] | None = setting(
-        None, "moment there: one number, of a solid three components [N m]"
-    )
-    displacement: Distance | None = setting(
-        None, "upper limit of the length of the interface's displacement [m]"
-    )
-    rotation: Angle | None = setting(
-        None, "upper limit of its rotation, of a solid its vector's length [rad]"
-    )
+    arm: str
+    force: TwoOrThree[Component] | None = None
+    moment: Component | Three[Component] | None = None
+    displacement: Distance | None = None
+    rotation: Angle | None = None
 
     @property
     def load(self) -> tuple[float, ...]:
@@ -205,10 +194,8 @@ def _declaration(name: str, entry: dict[str, Any]) -> Declaration:
     )
 
 
-_FILE = Path(__file__).parents[1] / "responses.toml"
 DECLARED = {
-    name: _declaration(name, entry)
-    for name, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items()
+    name: _declaration(name, entry) for name, entry in tables_of("scene/responses.toml").items()
 }
 # That of every design, or of all together, which [design] limits.
 VOLUME = DECLARED.pop("volume_fraction")
