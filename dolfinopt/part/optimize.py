@@ -306,7 +306,7 @@ class Descent:
     def _keep(self) -> None:
         """Say where the search is."""
         forms, best = (
-            {k: item.arrays for k, item in some.items()}
+            {k: item.sides for k, item in some.items()}
             for some in (self.search.state.outlines, self.forms)
         )
         tightened = self.search.problem.tightened
@@ -351,4 +351,4 @@ class Descent:
 
 def _restored(outlines: Outlines, forms: Forms) -> dict[int, FreeSides]:
     """Return what outlines had become, by what was kept of them."""
-    return {k: outlines[k].restored(arrays) for k, arrays in forms.items()}
+    return {k: replace(outlines[k], sides=sides) for k, sides in forms.items()}
