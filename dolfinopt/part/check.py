@@ -99,9 +99,13 @@ def simulate_parts(
         start: `Trajectory.solutions` of parts nearby.
         changes: tables of the scene that are other than the run's.
     """
+    from petsc4py import PETSc
+
     # Matrices of the parts before hang in cycles with their meshes; Python's collector, which does
-    # not see how large they are, would let many of them gather (17 GB of solids in a search).
+    # not see how large they are, would let many of them gather (17 GB of solids in a search), and
+    # petsc4py holds what has been collected until it is told to let it go: 80 MB each time.
     gc.collect()
+    PETSc.garbage_cleanup(PETSc.COMM_SELF)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for arm, owner in zip(scene.arms, scene.owners, strict=True):
