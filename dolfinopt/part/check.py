@@ -105,7 +105,6 @@ def simulate_parts(
     # not see how large they are, would let many of them gather (17 GB of solids in a search), and
     # petsc4py holds what has been collected until it is told to let it go: 80 MB each time.
     gc.collect()
-    PETSc.garbage_cleanup(PETSc.COMM_SELF)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for arm, owner in zip(scene.arms, scene.owners, strict=True):
@@ -116,6 +115,7 @@ def simulate_parts(
             data[table] = {**data.get(table, {}), **keys}
         machine = scene_from_dict(tomllib.loads(toml_text(data)), source="part.toml")
         partition, arms = _built(machine)
+        PETSc.garbage_cleanup(partition.comm)  # that of all arms on this rank
         x_phys = {k: np.ones(arm.mesh.num_cells) for k, arm in arms.items()}
         return _simulated(machine, partition, arms, x_phys, start)
 
