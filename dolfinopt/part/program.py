@@ -9,9 +9,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 # Of the columns that would lower the residual, how many are taken at a time. SciPy's `nnls` takes
-# one: 0.26 to 0.61 s for 446 x 1 100 to 1 300, with this 0.06 to 0.38, a third in all.
-SHARE = 0.3
-ROUNDING = 1e-13  # added to the squares of unit columns, which may depend on each other
+# one: 0.26 to 0.61 s for 446 x 1 100 to 1 300, with this 0.06 to 0.38, a third in all. And what is
+# added to the squares of unit columns, which may depend on each other.
+SHARE, ROUNDING = 0.3, 1e-13
 
 
 def least_move(A: np.ndarray, b: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray] | None:
