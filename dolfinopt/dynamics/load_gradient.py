@@ -51,8 +51,12 @@ def load_counts(body: ShapeIntegrals) -> LoadCounts:
 
 
 def load_gradient(
-    system: MachineSystem, t: np.ndarray, rates: Rates, by_coefficients: Sequence[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, list[ShapeIntegrals]]:
+    system: MachineSystem,
+    t: np.ndarray,
+    rates: Rates,
+    by_coefficients: Sequence[np.ndarray],
+    is_corrected: bool,
+) -> tuple[np.ndarray, np.ndarray | None, list[ShapeIntegrals]]:
     """Differentiate a function of `load_coefficients`, given its derivatives by them.
 
     Args:
@@ -60,10 +64,12 @@ def load_gradient(
         t: (n,) instants, s.
         rates: its unknowns and their derivatives there, each (n, S).
         by_coefficients: (n, 7 + 2 q or 18 + 9 q) of every body.
+        is_corrected: whether the motion of the joints follows the bodies.
 
     Returns:
         By the unknowns and their derivatives (3, n, S); by the rigid coordinates that the motion
-        prescribes and theirs (3, n, R); by every body's integrals, unknowns held.
+        prescribes and theirs (3, n, R) where these are corrected; by every body's integrals,
+        unknowns held.
     """
     probed = ProbedSystem(system)
     multipliers = np.zeros((len(t), probed.system.num_coordinates))
@@ -73,8 +79,10 @@ def load_gradient(
     instants = probed.system.at(t)
     by_rates = np.stack(instants.linearise(y, yd, ydd).transposed(multipliers))
     state = instants.state(y, yd, ydd)
-    by_command = state.by_command(np.arange(system.mechanism.num_rigid))
-    by_motion = np.einsum("ns,nsrk->knr", multipliers, by_command)
+    by_motion = None
+    if is_corrected:
+        by_command = state.by_command(np.arange(system.mechanism.num_rigid))
+        by_motion = np.einsum("ns,nsrk->knr", multipliers, by_command)
     wide = state.body_gradient(multipliers)
     by_bodies = [
         by.in_basis(np.eye(by.num_modes)[:, : body.num_modes])

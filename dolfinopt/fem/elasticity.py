@@ -88,8 +88,8 @@ class Substructure:
         self.T = InterfaceTransformation(mesh, operators, self._mass.pattern)
         solid = mesh.dim == 3 and mesh.wall is None
         box = box_of(self.T, self.cells, mesh.centroid) if solid else None
-        tetrahedra = operators.cells.shape[1] == 10
-        layout = interior_layout(mesh.name, self.T, self._pairs.pattern, tetrahedra, box)
+        simplices = operators.cell.is_simplex
+        layout = interior_layout(mesh.name, self.T, self._pairs.pattern, simplices, box)
         self.interior = LinearSystem(layout, profile, tolerance)
         self.extended = self._extended() if statics_alone and mesh.dim == 3 else None
         self._interior_mass_of: AssembledMatrix | None = None

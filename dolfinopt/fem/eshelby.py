@@ -5,8 +5,8 @@ With L = grad theta of a motion theta of the corners, H = H_n + H_a the gradient
 
     d|J| = |J| tr L,   dH_n = -H_n L,   dH_a = H_a (tr L_0 - tr L) - H_a L_0,
 
-L_0 being L at the cell's centre. So s : dH adds -H_n' s - (s : H_a) 1 to what multiplies L, and
-(s : H_a) 1 - H_a' s to what multiplies L_0: parts of Eshelby's tensor.
+L_0 being L at the cell's centre. So s : dH adds P_0 = (s : H_a) 1 - H_a' s to what multiplies L_0,
+and -H' s - P_0 to what multiplies L: parts of Eshelby's tensor.
 Source: Eshelby (1975), doi:10.1007/BF00126994.
 """
 
@@ -17,10 +17,10 @@ import numpy as np
 from dolfinopt.fem import forms
 from dolfinopt.fem.tensors import ElementTensors, element_centre, reference_gradients
 
-# Of e cells and q points: what multiplies L, and what multiplies L_0 (e, q, d, d).
-Eshelby = tuple[np.ndarray, np.ndarray]
-# Of k fields: H_n and H_a (e, q, k, d, d).
-Gradients = tuple[np.ndarray, np.ndarray]
+# Of e cells and q points: what multiplies L, and what multiplies L_0 (e, q, d, d); None: nothing.
+Eshelby = tuple[np.ndarray, np.ndarray | None]
+# Of k fields: H and H_a (e, q, k, d, d); None of elements without modes.
+Gradients = tuple[np.ndarray, np.ndarray | None]
 
 
 class GaussPoints:
@@ -35,16 +35,26 @@ class GaussPoints:
     ):
         """Take points (q, d) and weights (q,) of the reference cell; None: sums, no integrals."""
         cell, x = operators.cell, operators.corners[part]
-        inverse, det, self._corners = _mapped(cell, x, points)
-        inverse0, det0, self._centre = _mapped(cell, x, element_centre(cell))
-        self._weights = np.ones_like(det) if weights is None else np.abs(det) * weights
+        # The map of a simplex is the same at all points.
+        inverse, det, self._corners = _mapped(cell, x, points[: 1 if cell.is_simplex else None])
+        ones = np.ones((len(x), len(points)))
+        self._weights = ones if weights is None else np.abs(det) * weights
         self._nodes = reference_gradients(cell, cell.degree, points) @ inverse
-        bent = 1.0 - 2.0 * points[:, :, None] if cell.modes else np.zeros((len(points), 0, 1))
-        self._modes = (det0 / det)[:, :, None, None] * (bent * inverse0[:, :, : bent.shape[1]])
+        if cell.modes:
+            inverse0, det0, self._centre = _mapped(cell, x, element_centre(cell))
+            bent = (1.0 - 2.0 * points[:, :, None]) * inverse0
+            self._modes = (det0 / det)[:, :, None, None] * bent
 
     def gradients(self, nodal: np.ndarray, amplitudes: np.ndarray) -> Gradients:
-        """Return H_n and H_a of nodal values (e, n, d, k) and amplitudes (e, m, k)."""
-        return _gradients(nodal, self._nodes), self.modal(amplitudes)
+        """Return H and H_a of nodal values (e, n, d, k) and amplitudes (e, m, k)."""
+        if not amplitudes.shape[1]:
+            return self.nodal(nodal), None
+        modal = self.modal(amplitudes)
+        return self.nodal(nodal) + modal, modal
+
+    def nodal(self, values: np.ndarray) -> np.ndarray:
+        """Return H of nodal values (e, n, d, k) alone."""
+        return _gradients(values, self._nodes)
 
     def modal(self, amplitudes: np.ndarray) -> np.ndarray:
         """Return H_a alone."""
@@ -61,8 +71,13 @@ class GaussPoints:
     def by_corners(self, young: np.ndarray, parts: Eshelby) -> np.ndarray:
         """Return the derivative (e, c, d) of a functional, weighted by E (e,)."""
         weights = (self._weights * young[:, None])[:, :, None, None]
-        P, P0 = (weights * part.swapaxes(2, 3) for part in parts)
-        return (self._corners @ P).sum(axis=1) + self._centre[:, 0] @ P0.sum(axis=1)
+        P, P0 = (None if part is None else weights * part.swapaxes(2, 3) for part in parts)
+        by_corners = (self._corners @ P).sum(axis=1)
+        return by_corners if P0 is None else by_corners + self._centre[:, 0] @ P0.sum(axis=1)
+
+    def by_volume(self, density: np.ndarray) -> np.ndarray:
+        """Return the derivative (e, c, d) of the integral of a density (e, q), which is held."""
+        return ((self._weights * density)[:, :, None, None] * self._corners).sum(axis=1)
 
 
 def _mapped(
@@ -84,8 +99,11 @@ def _gradients(values: np.ndarray, functions: np.ndarray) -> np.ndarray:
 
 def varied(stress: np.ndarray, H: Gradients) -> Eshelby:
     """Return what s : dH adds, summed over the fields."""
-    own, (nodal, modal) = times_one(stress, H[1]), (_products(each, stress) for each in H)
-    return -nodal - own, own - modal
+    own, modal = -_products(H[0], stress), H[1]
+    if modal is None:
+        return own, None
+    P0 = times_one(stress, modal) - _products(modal, stress)
+    return own - P0, P0
 
 
 def _products(H: np.ndarray, stress: np.ndarray) -> np.ndarray:

@@ -52,11 +52,11 @@ class Cell:
         weight: of a cell.
         C: the law's constants, see `laws`.
         law: the stresses of a cell by its strains.
-        nodal, scalar: spaces of the nodes' displacements, and of one component.
+        scalar: space of one component of the nodes' displacements.
         modes: gradients of the incompatible modes; none of other elements.
         displacement: the space of nodes' displacements and modes' amplitudes.
         stresses: that of stresses and strains of a cell.
-        u, v, p, w: coefficients: displacements u and v, nodal vectors p and w.
+        u, v: coefficients, displacements.
     """
 
     def __init__(self, shape: str, element: str, law: Law = MaterialLaw.stress):
@@ -77,24 +77,17 @@ class Cell:
         kinds = d + len(SHEARS[d])
         self.C = ufl.Constant(self.mesh, shape=(kinds, kinds))
         self.scalar = self._space(lagrange_element(shape, self.degree))
-        self.nodal = self.displacement = self._space(lagrange_element(shape, self.degree, d))
+        self.displacement = self._space(lagrange_element(shape, self.degree, d))
         self.modes = incompatible_modes(self) if element == "incompatible" else []
         if self.modes:
             amplitudes = lagrange_element(shape, 0, len(self.modes))
             nodal = lagrange_element(shape, self.degree, d)
             self.displacement = self._space(mixed_element(nodal, amplitudes))
         self.stresses = self._space(lagrange_element(shape, 0, kinds))
-        spaces = self.displacement, self.displacement, self.nodal, self.nodal
-        self.u, self.v, self.p, self.w = (
-            ufl.Coefficient(space, count=3 + k) for k, space in enumerate(spaces)
-        )
+        self.u, self.v = (ufl.Coefficient(self.displacement, count=3 + k) for k in range(2))
 
     def _space(self, element: Any) -> Any:
         return ufl.FunctionSpace(self.mesh, element)
-
-    def dx(self, degree: int, simplex_degree: int) -> ufl.Measure:
-        """Return the measure that is exact to a degree; on quadrilaterals in every direction."""
-        return ufl.dx(self.mesh, degree=simplex_degree if self.is_simplex else degree)
 
     def gradient(self, u: Any) -> Any:
         """Return d_b u_a of a displacement, modes included."""
@@ -160,9 +153,9 @@ def dx_stiffness(cell: Cell) -> ufl.Measure:
     return ufl.dx(cell.mesh, degree=stiffness_degree(cell))
 
 
-def dx_mass(cell: Cell) -> ufl.Measure:
-    """Return that of a product of two functions."""
-    return cell.dx(2 * cell.degree + 2, 2 * cell.degree)
+def mass_degree(cell: Cell) -> int:
+    """Return the degree of a product of two functions."""
+    return 2 * cell.degree if cell.is_simplex else 2 * cell.degree + 2
 
 
 def geometric_degree(cell: Cell) -> int:
@@ -181,7 +174,8 @@ def stiffness(cell: Cell) -> Forms:
 
 def mass(cell: Cell) -> Forms:
     """Return int p w of one component."""
-    return [ufl.TrialFunction(cell.scalar) * ufl.TestFunction(cell.scalar) * dx_mass(cell)]
+    dx = ufl.dx(cell.mesh, degree=mass_degree(cell))
+    return [ufl.TrialFunction(cell.scalar) * ufl.TestFunction(cell.scalar) * dx]
 
 
 def stress_at(cell: Cell, points: Points) -> Forms:
@@ -203,19 +197,9 @@ def geometric_factors(cell: Cell, points: Points) -> Forms:
 # -- functionals of fields, which are differentiated by the corners' places -----------------------
 
 
-def volume(cell: Cell) -> ufl.Form:
-    """Return the weighted volume, in the plane area."""
-    return cell.weight * cell.dx(2, 0)
-
-
 def stiffness_product(cell: Cell) -> ufl.Form:
     """Return the weighted int sigma(u) : eps(v)."""
     return cell.weight * ufl.inner(cell.stress(cell.u), cell.strain(cell.v)) * dx_stiffness(cell)
-
-
-def mass_product(cell: Cell) -> ufl.Form:
-    """Return the weighted int p . w."""
-    return cell.weight * ufl.inner(cell.p, cell.w) * dx_mass(cell)
 
 
 def value(cell: Cell, functional: Functional) -> Forms:

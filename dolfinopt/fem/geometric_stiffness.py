@@ -96,6 +96,13 @@ class UnitLoads:
         result = accelerations(np.ones_like(points), points)
         return result if self.modes is None else np.concatenate([result, self.modes], axis=2)
 
+    @cached_property
+    def residual(self) -> np.ndarray:
+        """K u_p - f_p (n_nodes, d, p) but for what loads interfaces, of this rank's cells."""
+        result = self.arm.stiffness_times(self.fields)
+        result[:, :, : self.num_inertial] -= self.arm.mass_times(self.accelerations)
+        return result
+
     def by_levers(self, face: FaceGradient) -> np.ndarray:
         """Return the derivatives (n_nodes, d) by the interfaces' nodes, see `FaceRotation`."""
         return self._face.by_levers(face.by_S, self.fields, self.accelerations)
@@ -179,12 +186,10 @@ class GeometricGradient:
         move the interfaces' nodes; and by the nodes' places as lever arms (n_nodes, d).
         """
         loads, arm = self.loads, self.loads.arm
-        T, accelerations = arm.substructure.T, loads.accelerations
-        residual = arm.stiffness_times(loads.fields)
-        residual[:, :, : loads.num_inertial] -= arm.mass_times(accelerations)
+        T = arm.substructure.T
         by_fields = self.by_fields - arm.stiffness_times(self.adjoint)
         rigid = by_fields @ T.coordinates(loads.fields).T
-        rigid -= residual @ T.coordinates(self.adjoint).T
+        rigid -= loads.residual @ T.coordinates(self.adjoint).T
         return rigid, loads.by_levers(self.face)
 
     @cached_property

@@ -28,8 +28,8 @@ from dolfinopt.fem.measured import (
     BAND_WORK_LIMIT,
     FACTOR_BYTES,
     FACTOR_EXPONENT,
+    SIMPLICES_BAND_WORK_LIMIT,
     SOLID_BAND_WORK_LIMIT,
-    TETRAHEDRA_BAND_WORK_LIMIT,
     WIDEST,
     WIDEST_OF_STATICS,
 )
@@ -77,7 +77,7 @@ class Layout:
 
 
 def interior_layout(
-    name: str, T: InterfaceTransformation, pattern: sp.csr_matrix, tetrahedra: bool, box: Box | None
+    name: str, T: InterfaceTransformation, pattern: sp.csr_matrix, simplices: bool, box: Box | None
 ) -> Layout:
     """Return that of K_II.
 
@@ -85,12 +85,12 @@ def interior_layout(
         name: of the arm.
         T: numbers the interior dofs.
         pattern: of the nodes.
-        tetrahedra: whether the mesh is of quadratic tetrahedra, whose bands are wide.
+        simplices: whether the mesh is of triangles or tetrahedra, whose bands are wide.
         box: see `Layout`.
     """
-    limit = BAND_WORK_LIMIT
-    if T.dim == 3:
-        limit = TETRAHEDRA_BAND_WORK_LIMIT if tetrahedra else SOLID_BAND_WORK_LIMIT
+    limit = BAND_WORK_LIMIT if T.dim == 2 else SOLID_BAND_WORK_LIMIT
+    if simplices:
+        limit = SIMPLICES_BAND_WORK_LIMIT
     return Layout(
         name,
         T.comm,

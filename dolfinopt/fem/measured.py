@@ -52,10 +52,11 @@ WIDEST = 1200
 WIDEST_OF_STATICS = 250
 # Their tolerance, in energy, relative, unless the scene's is less: gradients are a factor's then.
 STATICS_TOLERANCE = 1e-10
-# Rows times bandwidth squared up to which a band of quadratic tetrahedra is factorised, whose
-# meshes are irregular. CPU seconds of a body for a nearby design, by MUMPS and the band:
-# 9 678 rows of a slender link 0.06, 0.08; 24 213 rows 0.19, 0.35; 62 856 rows 0.71, 2.53.
-TETRAHEDRA_BAND_WORK_LIMIT = 1e9
+# Rows times bandwidth squared up to which a band of triangles or tetrahedra is factorised, whose
+# meshes are irregular. Milliseconds of a new mesh's factor, of the next one, and of eleven right
+# sides, by MUMPS and the band: 7 928 rows of a plane part, 2.5e8: 35, 38; 9, 12; 5, 6; 20 020 rows,
+# 1.8e9: 105, 107; 20, 63; 10, 75; and of a solid link's body, 24 213 rows: 190, 350 in all.
+SIMPLICES_BAND_WORK_LIMIT = 2e8
 # Bytes of MUMPS' factor of a solid: so many times the rows to this power, 0.7 GB of 50 000 rows.
 FACTOR_BYTES, FACTOR_EXPONENT = 3.8e3, 1.12
 

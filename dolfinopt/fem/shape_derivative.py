@@ -1,13 +1,12 @@
 """Derivatives of what the cells of one arm add to, by the places of the cells' corners.
 
-UFL differentiates the functionals of `forms`; shape functions are held in the reference cell. The
-amplitudes of incompatible modes are held, too, where a functional is stationary in them. Others
-follow the cells' equilibrium: with k_aa a + k_au u = 0 and k_aa alpha = dF/da
+Shape functions are held in the reference cell. The amplitudes of incompatible modes are held, too,
+where a functional is stationary in them. Others follow the cells' equilibrium: with
+k_aa a + k_au u = 0 and k_aa alpha = dF/da
 
     dF = ... - alpha' (dk_aa a + dk_au u).
 
-Volume and mass alone come from UFL: products of fields with stiffness, geometric stiffness and
-stress from `eshelby`, all pairs at once. Kernels of UFL's derivatives take as long for one pair of
+All pairs of fields at once, by `eshelby`. Kernels of UFL's derivatives take as long for one pair of
 fields, 2.6 times as long for five and 6 times for eighteen (9 600 hexahedra: 2.5 against 0.41 s),
 and 7 times for 18 fields in 6 modes (6.2 against 0.82 s).
 Source: Haslinger & Makinen, Introduction to Shape Optimization (2003), doi:10.1137/1.9780898718690,
@@ -38,10 +37,10 @@ from dolfinopt.fem.laws import ROWS, SHEARS, VON_MISES
 from dolfinopt.fem.measured import DERIVATIVE_CHUNK_CELLS
 from dolfinopt.fem.tensors import (
     ElementTensors,
-    corner_functions,
     gauss_points,
     geometry,
     node_places,
+    reference_functions,
 )
 from dolfinopt.mesh import compat
 
@@ -73,15 +72,21 @@ class ShapeDerivative:
 
     def mass(self, left: np.ndarray, right: np.ndarray, density: np.ndarray) -> np.ndarray:
         """Differentiate sum_k left_k' M right_k of nodal fields (n_nodes, d, k)."""
-        cell, result = self._cell, self._zeros()
-        for p, w in zip(self._columns(left), self._columns(right), strict=True):
-            values = {cell.p: p, cell.w: w, cell.weight: density[:, None]}
-            result += self._by_corners(values, forms.mass_product)
+        cell, result = self._cell, np.zeros_like(self._operators.corners)
+        rule = gauss_points(cell, forms.mass_degree(cell))
+        functions = reference_functions(cell, cell.degree, rule[0])
+        for part in self._runs():
+            nodal = (field[self._operators.cells[part]] for field in (left, right))
+            p, w = (functions @ each.reshape(*each.shape[:2], -1) for each in nodal)
+            products = density[part, None] * (p * w).sum(axis=2)
+            result[part] = GaussPoints(self._operators, part, *rule).by_volume(products)
         return self._operators.thickness * result
 
     def volume(self, by_volume: np.ndarray) -> np.ndarray:
         """Differentiate a function of the cells' areas, in space volumes (n_cells,)."""
-        return self._by_corners({self._cell.weight: by_volume[:, None]}, forms.volume)
+        rule = gauss_points(self._cell, forms.mass_degree(self._cell))
+        points = GaussPoints(self._operators, slice(None), *rule)
+        return points.by_volume(by_volume[:, None])
 
     def geometric_stiffness(
         self, fields: np.ndarray, V: np.ndarray, by_K0: np.ndarray, young: np.ndarray
@@ -101,14 +106,15 @@ class ShapeDerivative:
         rule = gauss_points(operators.cell, forms.geometric_degree(operators.cell))
         for part in self._runs():
             points, values = GaussPoints(operators, part, *rule), self._values(fields, part)
-            u, (H, _) = points.gradients(*values), points.gradients(*self._values(V, part))
+            u, H = points.gradients(*values), points.nodal(V[operators.cells[part]])
             G = (by @ products_of_pairs(H)).reshape(u[0].shape)
-            stress, along = self._stress(part, u[0] + u[1]), self._stress(part, G)
+            stress, along = self._stress(part, u[0]), self._stress(part, G)
             P, P0 = varied(along, u)
             P = P + times_one(stress, G) - 2.0 * (G @ stress).sum(axis=2)
-            by_amplitudes = points.by_amplitudes(young[part], along)
             result[part] = points.by_corners(young[part], (P, P0))
-            result[part] += self._followed(part, values, by_amplitudes)
+            if u[1] is not None:
+                by_amplitudes = points.by_amplitudes(young[part], along)
+                result[part] += self._followed(part, values, by_amplitudes)
         return operators.thickness * result
 
     def stress(self, at: np.ndarray, by_stress: np.ndarray, fields: np.ndarray) -> np.ndarray:
@@ -127,9 +133,9 @@ class ShapeDerivative:
             C, ones = of_cells(self._tangent, part), np.ones(len(by[part]))
             along = (by[part] @ C[:, None])[..., ROWS[operators.cell.dim]]
             parts = varied(along, points.gradients(*values))
-            by_amplitudes = points.by_amplitudes(ones, along)
             result[part] = points.by_corners(ones, parts)
-            result[part] += self._followed(part, values, by_amplitudes)
+            if parts[1] is not None:
+                result[part] += self._followed(part, values, points.by_amplitudes(ones, along))
         return result
 
     # -- of runs of cells ----------------------------------------------------------------------
@@ -152,8 +158,7 @@ class ShapeDerivative:
         u = points.gradients(nodal @ back[:, None], amplitudes @ back)
         unit = np.broadcast_to(np.eye(alpha.shape[1]), (len(alpha), *2 * (alpha.shape[1],)))
         modal = points.modal(unit)
-        v = np.zeros_like(modal), modal
-        return points.by_corners(np.ones(len(back)), self._energy(part, u, v))
+        return points.by_corners(np.ones(len(back)), self._energy(part, u, (modal, modal)))
 
     def _stiffness_points(self, part: slice) -> GaussPoints:
         cell = self._operators.cell
@@ -180,19 +185,11 @@ class ShapeDerivative:
 
     def _energy(self, part: slice, u: Gradients, v: Gradients) -> Eshelby:
         """Return that of s(u) : H(v)."""
-        s, t = self._stress(part, u[0] + u[1]), self._stress(part, v[0] + v[1])
+        s, t = self._stress(part, u[0]), self._stress(part, v[0])
         (P, P0), (Q, Q0) = varied(t, u), varied(s, v)
-        return P + Q + times_one(s, v[0] + v[1]), P0 + Q0
+        return P + Q + times_one(s, v[0]), None if P0 is None or Q0 is None else P0 + Q0
 
     # -- by the kernels of a functional --------------------------------------------------------
-
-    def _zeros(self) -> np.ndarray:
-        return np.zeros_like(self._operators.corners)
-
-    def _columns(self, field: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield the cells' nodal values (n_cells, dn) of each column of a field."""
-        for k in range(field.shape[2]):
-            yield field[:, :, k][self._operators.cells].reshape(len(self._coordinates), -1)
 
     def recovered(self, u: np.ndarray) -> np.ndarray:
         """Return nodal values with the amplitudes of the modes behind them."""
@@ -203,11 +200,6 @@ class ShapeDerivative:
         known = geometry(self._cell, self._coordinates, self._operators.law) | values
         kernels = self._operators.kernels(make, *functional)
         return [kernel(self._coordinates, known) for kernel in kernels]
-
-    def _by_corners(self, values: Values, *functional: Any) -> np.ndarray:
-        """Differentiate a functional, the amplitudes of modes held."""
-        parts = self.run(forms.by_corners, values, *functional)
-        return np.sum(parts, axis=0).reshape(self._operators.corners.shape)
 
     # -- from corners to the nodes of the mesh -----------------------------------------------
 
@@ -245,7 +237,7 @@ class ShapeDerivative:
     def _follow(self) -> sp.csr_matrix:
         """How the element's nodes (n_nodes) move with those of the mesh (n)."""
         cells = self._operators.cells
-        shares = corner_functions(self._cell, node_places(self._cell))
+        shares = reference_functions(self._cell, 1, node_places(self._cell))
         nodes, first = np.unique(cells.ravel(), return_index=True)
         cell, place = np.divmod(first, cells.shape[1])
         where = np.repeat(nodes, shares.shape[1]), self._nodes[cell].ravel()

@@ -32,7 +32,7 @@ from dolfinopt.fem.frames import (
 from dolfinopt.fem.geometric_stiffness import FaceRotation, UnitLoads
 from dolfinopt.fem.laws import VON_MISES
 from dolfinopt.fem.measured import ROUNDING_SHARE
-from dolfinopt.fem.tensors import ElementTensors, corner_functions
+from dolfinopt.fem.tensors import ElementTensors, reference_functions
 from dolfinopt.parallel import on_root
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 def places_of(operators: ElementTensors, points: np.ndarray) -> np.ndarray:
     """Return where points (p, d) of the reference cell are in every cell (n_cells, p, d), m."""
-    return corner_functions(operators.cell, points) @ operators.corners
+    return reference_functions(operators.cell, 1, points) @ operators.corners
 
 
 def stress_operator(operators: ElementTensors, points: np.ndarray) -> sp.csr_matrix:

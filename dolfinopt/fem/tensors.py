@@ -263,9 +263,9 @@ def stress_points(cell: forms.Cell) -> np.ndarray:
     return np.concatenate([element_centre(cell), points])
 
 
-def corner_functions(cell: forms.Cell, points: np.ndarray) -> np.ndarray:
-    """Return the linear functions (p, c) of the corners at points (p, d) of the reference cell."""
-    return np.asarray(_lagrange(cell, 1).tabulate(0, points)[0, :, :, 0])
+def reference_functions(cell: forms.Cell, degree: int, points: np.ndarray) -> np.ndarray:
+    """Return the functions (p, n) of a degree at points (p, d) of the reference cell."""
+    return np.asarray(_lagrange(cell, degree).tabulate(0, points)[0, :, :, 0])
 
 
 def reference_gradients(cell: forms.Cell, degree: int, points: np.ndarray) -> np.ndarray:

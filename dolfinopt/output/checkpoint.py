@@ -37,10 +37,9 @@ CLASSES = {
     "dolfinopt.responses.order_selection": ("OrderSelection",),
     "dolfinopt.multibody.loads": ("Stiffening",),
     "dolfinopt.dynamics.collocation": ("Solution", "Strategy"),
-    "numpy": ("ndarray", "dtype"),
 }
 copyreg.pickle(Strategy, lambda item: (Strategy, (item.value,)))  # by its class alone
-MAKERS = "_reconstruct", "_frombuffer", "scalar"  # of NumPy's private modules
+MAKERS = "ndarray", "dtype", "_reconstruct", "_frombuffer", "scalar"  # of NumPy, private ones too
 # Keys a resumed run may change: when to stop, and how to go on from where it is.
 MAY_CHANGE = {
     *(f"optimizer.{key}" for key in ("max_iterations", "tolerance", "kkt_tolerance")),
@@ -195,12 +194,22 @@ def _of_run(memory: Memory) -> dict[str, np.ndarray]:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Reads a memory, and nothing else."""
+    """Reads data of some classes and arrays, and nothing else."""
+
+    classes: Mapping[str, Sequence[str]]
 
     def find_class(self, module: str, name: str) -> Any:
-        if name in CLASSES.get(module, MAKERS if module.startswith("numpy.") else ()):
+        numpy = MAKERS if module.split(".")[0] == "numpy" else ()
+        if name in self.classes.get(module, numpy):
             return super().find_class(module, name)
         raise pickle.UnpicklingError(f"{module}.{name}")
+
+
+def unpickled(data: np.ndarray, classes: Mapping[str, Sequence[str]]) -> Any:
+    """Return what was pickled, of classes by their modules and of arrays alone."""
+    reader = _Unpickler(BytesIO(data.tobytes()))
+    reader.classes = classes
+    return reader.load()
 
 
 def _of_arms(
@@ -230,7 +239,7 @@ def _of_arm(arm: Arm, index: int, memory: Memory, number: int) -> dict[str, np.n
 
 def _memory(arrays: Mapping[str, np.ndarray], arms: Mapping[int, Arm]) -> Memory:
     """Return the checkpoint's memory, cells and modes of this rank's arms."""
-    memory: Memory = _Unpickler(BytesIO(arrays["memory"].tobytes())).load()
+    memory: Memory = unpickled(arrays["memory"], CLASSES)
     cells = dict(memory.cells)
     for k, arm in arms.items():
         if f"arm{k}/cells" in arrays:

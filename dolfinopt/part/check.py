@@ -99,8 +99,11 @@ def simulate_parts(
         start: `Trajectory.solutions` of parts nearby.
         changes: tables of the scene that are other than the run's.
     """
+    from petsc4py import PETSc
+
     # Matrices of the parts before hang in cycles with their meshes; Python's collector, which does
-    # not see how large they are, would let many of them gather (17 GB of solids in a search).
+    # not see how large they are, would let many of them gather (17 GB of solids in a search), and
+    # petsc4py holds what has been collected until it is told to let it go: 80 MB each time.
     gc.collect()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -112,6 +115,7 @@ def simulate_parts(
             data[table] = {**data.get(table, {}), **keys}
         machine = scene_from_dict(tomllib.loads(toml_text(data)), source="part.toml")
         partition, arms = _built(machine)
+        PETSc.garbage_cleanup(partition.comm)  # that of all arms on this rank
         x_phys = {k: np.ones(arm.mesh.num_cells) for k, arm in arms.items()}
         return _simulated(machine, partition, arms, x_phys, start)
 

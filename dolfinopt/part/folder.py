@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
+import pickle
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ import numpy as np
 
 from dolfinopt.disk import read_arrays, working_in, write_arrays, write_bytes, write_text, writing
 from dolfinopt.errors import InputError
+from dolfinopt.output.checkpoint import unpickled
 from dolfinopt.output.folders import PARTS_LIST, prepare_folder, record_of_parts, remove_stale
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import with_relative_paths
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from dolfinopt.part.check import Check
     from dolfinopt.part.optimize import Optimized
     from dolfinopt.part.part import Part, PartMesh
+    from dolfinopt.part.plane.sides import Sides
     from dolfinopt.scene.tables.design import Part as Asked
 
 PLATE = (".step", "_face.step", ".dxf", "_r12.dxf", ".svg", ".stl", ".msh")
@@ -245,7 +249,13 @@ def _is_table(value: Any) -> bool:
 # -- shapes.npz: what a search over shapes leaves at every step, so that a killed one can go on --
 
 SHAPES = "shapes.npz"
-Forms = Mapping[int, Mapping[str, np.ndarray]]  # arrays of the free form of every part
+Forms = Mapping[int, "Sides"]  # of every part
+# All that the file may name, see `output.checkpoint`.
+CLASSES = {
+    "dolfinopt.part.folder": ("Saved",),
+    "dolfinopt.part.plane.curves": ("Arc", "Line", "Piece", "Spline"),
+    "dolfinopt.part.plane.sides": ("Circle", "Corner", "Loop", "Side", "Sides"),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,6 +279,15 @@ class Saved:
     best: Forms
 
 
+class _Pickler(pickle.Pickler):
+    """Writes the fields of data classes, and not what was computed of them."""
+
+    def reducer_override(self, item: Any) -> Any:
+        if isinstance(item, type) or not is_dataclass(item):
+            return NotImplemented
+        return type(item), tuple(getattr(item, each.name) for each in fields(item))
+
+
 @dataclass(frozen=True)
 class Checkpoint:
     """The file of a search over shapes.
@@ -283,16 +302,11 @@ class Checkpoint:
 
     def replace(self, searches: Sequence[Saved]) -> None:
         """Write where the searches from all starts so far are."""
-        told = [
-            [search.start, search.done, search.ending, dict(search.tightened)]
-            for search in searches
-        ]
-        arrays = {"question": np.array(self.question), "searches": np.array(json.dumps(told))}
-        for search in searches:
-            for kind, forms in (("forms", search.forms), ("best", search.best)):
-                for k, form in forms.items():
-                    arrays |= {f"{search.start}/{kind}/{k}/{name}": a for name, a in form.items()}
+        stream = io.BytesIO()
+        _Pickler(stream).dump(tuple(searches))
+        pickled = np.frombuffer(stream.getvalue(), np.uint8)
         prepare_folder(self.folder)
+        arrays = {"question": np.array(self.question), "pickled": pickled}
         write_arrays(self.folder / SHAPES, arrays)
 
     def read(self) -> tuple[Saved, ...]:
@@ -307,19 +321,11 @@ class Checkpoint:
         arrays = read_arrays(path, remedy)
         if str(arrays.get("question")) != self.question:
             raise InputError(f"{path}: --resume: of another design, or other options; {remedy}")
-
-        def forms(start: int, kind: str) -> Forms:
-            result: dict[int, dict[str, np.ndarray]] = {}
-            for key, array in arrays.items():
-                if key.startswith(f"{start}/{kind}/"):
-                    _, _, k, name = key.split("/", 3)
-                    result.setdefault(int(k), {})[name] = array
-            return result
-
-        return tuple(
-            Saved(start, done, ending, tightened, forms(start, "forms"), forms(start, "best"))
-            for start, done, ending, tightened in json.loads(str(arrays["searches"]))
-        )
+        try:
+            searches: tuple[Saved, ...] = unpickled(arrays["pickled"], CLASSES)
+        except Exception:  # whatever a foreign file may raise
+            raise InputError(f"{path}: --resume cannot read these shapes; {remedy}") from None
+        return searches
 
     def remove(self) -> None:
         """Remove the file: the search has come to its end."""

@@ -23,7 +23,7 @@ from dolfinopt.mesh.solid_cells import TENSOR, boundary, msh_bytes
 from dolfinopt.part.part import DEFAULTS, Curves
 from dolfinopt.part.plane.curves import MM
 from dolfinopt.part.solid.surface import Surface, check_surface
-from dolfinopt.part.stress import EDGE_DISTANCE, REENTRANT_SINE, CornerStress, mean_at_corners
+from dolfinopt.part.stress import REENTRANT_SINE, CornerStress, clearance, mean_at_corners
 from dolfinopt.part.workshop_files import three_mf_bytes, triangle_bytes
 from dolfinopt.scene.tables.arms import WALL_KEYS
 
@@ -153,7 +153,7 @@ class HollowPart:
         That is where the wall meets the rigid interfaces, and along inner edges.
         """
         x = self.hull.outer[:, 0, 0]
-        far = max(margin, EDGE_DISTANCE * float(np.median(np.diff(x))))
+        far = max(margin, clearance(float(np.median(np.diff(x))), 3))
         result = (places[:, 0] >= x[0] + far) & (places[:, 0] <= x[-1] - far)
         # The mitre of a section that turns by 2 a is 1 / cos a.
         turn = 2.0 * np.arccos(1.0 / np.linalg.norm(self.hull.inward, axis=2).clip(1.0))
@@ -161,7 +161,7 @@ class HollowPart:
         if edges.any():
             inner = (self.hull.outer + self.thickness[:, :, None] * self.hull.inward)[edges]
             across = cKDTree(inner[:, 1:]).query(places[:, 1:])[0]
-            result &= across > EDGE_DISTANCE * self.thickness.min()
+            result &= across > clearance(self.thickness.min(), 3)
         return np.asarray(result)
 
     def stress(self, state: DesignState) -> CornerStress:

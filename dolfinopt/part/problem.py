@@ -202,7 +202,7 @@ class Problem:
 
     def stress_slopes(self, state: State, keys: Sequence[Place]) -> list[np.ndarray]:
         """Return the derivatives (n,) of `State.places` of some places."""
-        return [self._by_x(state, [self._by_stress(state, *key)])[0] for key in keys]
+        return list(self._by_x(state, [self._by_stress(state, *key) for key in keys]))
 
     def _by_stress(self, state: State, arm: int, piece: int) -> dict[int, np.ndarray]:
         """Return the derivatives of `State.places` of one place by the nodes of all arms."""

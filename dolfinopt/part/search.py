@@ -123,8 +123,8 @@ class Search:
             elif not self._simplified():
                 return "no step betters the parts"
 
-    def restore(self, tell: Tell) -> None:
-        """Take a few steps that meet the limits above all; as many as that needs."""
+    def restore(self, tell: Tell, enough: Callable[[], bool]) -> None:
+        """Take a few steps that meet the limits above all, until they do or are `enough`."""
         self._mesh_anew()
         self.radius = NEARBY  # what the finer mesh says holds nearby
         for _ in range(RESTORING):
@@ -132,6 +132,8 @@ class Search:
             if self.state.excess <= EXCESS or not self._step():
                 break
             tell(self._line())
+            if enough():
+                break
 
     def _mesh_anew(self) -> None:
         """Go on with new meshes."""

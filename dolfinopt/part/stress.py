@@ -273,12 +273,18 @@ class OutlineStress(Stress):
         return self._points(index, state)
 
 
-# -- in the plane: on the outline, away from singular points -----------------------------------
+# -- away from singular points and edges ---------------------------------------------------------
 
 
-# From a singular point, in cells of the design: the centre of the design's cell in such a corner,
-# where its stress is known, is as far away.
-CORNER_DISTANCE = np.sqrt(0.5)
+def clearance(cell: float, dim: int) -> float:
+    """Return how far from them stress counts, m.
+
+    The centre of the design's cell in such a corner, where its stress is known, is as far away.
+    """
+    return 0.5 * float(np.sqrt(dim)) * cell
+
+
+# -- in the plane: on the outline --------------------------------------------------------------
 
 
 def singular_points(shape: Shape) -> np.ndarray:
@@ -307,19 +313,16 @@ def is_regular_in_plane(
     far = np.ones(len(places), dtype=bool)
     if len(singular := singular_points(shape)):
         gaps = np.linalg.norm(places[:, None] - singular, axis=2)
-        far = gaps.min(axis=1) >= CORNER_DISTANCE * domain.cell
+        far = gaps.min(axis=1) >= clearance(domain.cell, 2)
     if margin > 0.0:
         at = shapely.points(places)
         far &= shapely.distance(at, shapely.union_all(interfaces(domain))) >= margin
     return far
 
 
-# -- in space: on the surface, away from singular edges ----------------------------------------
+# -- in space: on the surface ------------------------------------------------------------------
 
 
-# From a singular edge, in cells of the design: the centre of the design's cell in such a corner,
-# where its stress is known, is as far away.
-EDGE_DISTANCE = np.sqrt(0.75)
 REENTRANT_SINE = np.sin(np.radians(40.0))  # of the turn at a re-entrant edge
 
 
@@ -333,7 +336,7 @@ def is_regular_in_space(domain: SolidDomain, places: np.ndarray, margin: float) 
     """
     far = np.ones(len(places), dtype=bool)
     if len(edges := singular_edges(domain)):
-        far = distance_to_faces(places, edges) >= EDGE_DISTANCE * domain.cell
+        far = distance_to_faces(places, edges) >= clearance(domain.cell, 3)
     if margin > 0.0:
         for faces in (domain.inboard, domain.outboard):
             far &= distance_to_faces(places, faces) >= margin

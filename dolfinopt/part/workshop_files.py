@@ -21,7 +21,7 @@ from dolfinopt.part.solid.surface import Surface
 
 HALF = 0.9 * np.pi  # sweep of an arc from which on it is divided
 DATE = "2000-01-01T00:00:00"  # of all files, as in DXF: a shape always gives the same bytes
-UP = (0.0, 0.0, 1.0)
+UP = np.array([0.0, 0.0, 1.0])
 NamedCurves = Sequence[tuple[Curve, str]]  # a closed loop, each curve with its name
 
 
@@ -86,9 +86,8 @@ def _edges_at(file: _File, loop: NamedCurves, z: float) -> list[str]:
     """Add a loop's edges at a height, mm, and return them; each ends where the next one begins."""
     corners, result = [file.vertex(curve.start, z) for curve, _ in loop], []
     for (curve, name), a, b in zip(loop, corners, [*corners[1:], corners[0]], strict=True):
-        sense = ".F." if isinstance(curve, Arc) and curve.sweep < 0.0 else ".T."
-        edge = f"EDGE_CURVE({_string(name)},{a},{b},{file.curve(curve, z)},{sense})"
-        result.append(file.add(edge))
+        entity, along = file.curve(curve, z)
+        result.append(file.add(f"EDGE_CURVE({_string(name)},{a},{b},{entity},{_truth(along)})"))
     return result
 
 
@@ -97,32 +96,35 @@ def _walls(file: _File, loop: NamedCurves, z0: float, z1: float) -> list[str]:
     posts, result = [], []
     for curve, _ in loop:
         a, b = (file.vertex(curve.start, z) for z in (z0, z1))
-        line = f"LINE('',{file.point(curve.start, z0)},{file.vector(UP)})"
-        posts.append(file.add(f"EDGE_CURVE('',{a},{b},{file.add(line)},.T.)"))
+        line, _ = file.line(curve.start, z0, UP)
+        posts.append(file.add(f"EDGE_CURVE('',{a},{b},{line},.T.)"))
     edges = (_edges_at(file, loop, z) for z in (z0, z1))
     for (curve, name), low, high, post, after in zip(
         loop, *edges, posts, [*posts[1:], posts[0]], strict=True
     ):
-        bound = _bound(file, [(low, ".T."), (after, ".T."), (high, ".F."), (post, ".F.")])
-        surface, sense = file.wall(curve, z0)
+        sides = [(low, ".T."), (after, ".T."), (high, ".F."), (post, ".F.")]
+        bound = _bound(file, sides, ".T.")
+        surface, outwards = file.wall(curve, z0)
+        sense = _truth(outwards)
         result.append(file.add(f"ADVANCED_FACE({_string(name)},({bound}),{surface},{sense})"))
     return result
 
 
-def _bound(file: _File, sides: Iterable[tuple[str, str]]) -> str:
-    edges = ",".join(file.add(f"ORIENTED_EDGE('',*,*,{edge},{sense})") for edge, sense in sides)
+def _bound(file: _File, sides: Iterable[tuple[str, str]], sense: str) -> str:
+    edges = ",".join(file.add(f"ORIENTED_EDGE('',*,*,{edge},{way})") for edge, way in sides)
     loop = file.add(f"EDGE_LOOP('',({edges}))")
-    return file.add(f"FACE_BOUND('',{loop},.T.)")
+    return file.add(f"FACE_BOUND('',{loop},{sense})")
 
 
 def _flat_face(file: _File, loops: Sequence[NamedCurves], z: float, upwards: bool) -> str:
     """Add the plane face within loops at a height, material to their left from above."""
-    sense = ".T." if upwards else ".F."
+    # The other way round, as the faces beside it need these edges.
+    way, sense, step = (".F.", ".T.", -1) if upwards else (".T.", ".F.", 1)
     bounds = []
     for loop in loops:
-        edges = _edges_at(file, loop, z)[:: 1 if upwards else -1]
-        bounds.append(_bound(file, [(edge, sense) for edge in edges]))
-    plane = file.add(f"PLANE('',{file.axes(np.zeros(2), z, UP, (1.0, 0.0, 0.0))})")
+        edges = [(edge, way) for edge in _edges_at(file, loop, z)[::step]]
+        bounds.append(_bound(file, edges, ".F."))
+    plane = file.add(f"PLANE('',{file.axes(np.zeros(2), z)})")
     return file.add(f"ADVANCED_FACE('',({','.join(bounds)}),{plane},{sense})")
 
 
@@ -141,47 +143,59 @@ class _File:
         return self.entities.setdefault(entity, f"#{len(self.entities) + 1}")
 
     def point(self, place: np.ndarray, z: float) -> str:
-        return self.add(f"CARTESIAN_POINT('',{_reals((MM * place[0], MM * place[1], z))})")
+        return self.add(f"CARTESIAN_POINT('',{_reals(np.round([*MM * place, z], 6) + 0.0)})")
 
     def vertex(self, place: np.ndarray, z: float) -> str:
         return self.add(f"VERTEX_POINT('',{self.point(place, z)})")
 
-    def direction(self, along: Sequence[float]) -> str:
-        return self.add(f"DIRECTION('',{_reals(along)})")
+    def direction(self, way: np.ndarray) -> tuple[str, bool]:
+        """Add a direction, or the opposite one; return it and whether it is this one.
 
-    def vector(self, along: Sequence[float]) -> str:
-        return self.add(f"VECTOR('',{self.direction(along)},1.)")
+        Its largest component is 1: parallel sides share it.
+        """
+        largest = way[np.argmax(np.abs(way))]
+        return self.add(f"DIRECTION('',{_reals(way / largest + 0.0)})"), bool(largest > 0.0)
 
-    def axes(self, at: np.ndarray, z: float, up: Sequence[float], ahead: Sequence[float]) -> str:
-        origin, axis, first = self.point(at, z), self.direction(up), self.direction(ahead)
-        return self.add(f"AXIS2_PLACEMENT_3D('',{origin},{axis},{first})")
+    def line(self, start: np.ndarray, z: float, way: np.ndarray) -> tuple[str, bool]:
+        """Add a line from a point; return it and whether it runs this way."""
+        direction, along = self.direction(way)
+        vector = self.add(f"VECTOR('',{direction},1.)")
+        return self.add(f"LINE('',{self.point(start, z)},{vector})"), along
 
-    def curve(self, curve: Curve, z: float) -> str:
-        """Add a curve at a height; circles counterclockwise."""
+    def axes(self, at: np.ndarray, z: float, directions: str = "$,$") -> str:
+        """Add axes; by default with the directions of the file's own."""
+        return self.add(f"AXIS2_PLACEMENT_3D('',{self.point(at, z)},{directions})")
+
+    def curve(self, curve: Curve, z: float) -> tuple[str, bool]:
+        """Add a curve at a height; return it and whether it runs this way."""
         if isinstance(curve, Line):
-            return self.add(f"LINE('',{self.point(curve.start, z)},{self.vector(_along(curve))})")
+            return self.line(curve.start, z, np.append(curve.end - curve.start, 0.0))
         if isinstance(curve, Arc):
-            axes = self.axes(curve.centre, z, UP, (1.0, 0.0, 0.0))
-            return self.add(f"CIRCLE('',{axes},{_real(MM * curve.radius)})")
+            axes = self.axes(curve.centre, z)
+            circle = self.add(f"CIRCLE('',{axes},{_real(MM * curve.radius)})")
+            return circle, curve.sweep > 0.0
         points = ",".join(self.point(p, z) for p in curve.points)
         knots, counts = np.unique(curve.knots, return_counts=True)
         return self.add(
             f"B_SPLINE_CURVE_WITH_KNOTS('',{DEGREE},({points}),.UNSPECIFIED.,.F.,.F.,"
             f"({','.join(map(str, counts.tolist()))}),{_reals(knots)},.UNSPECIFIED.)"
-        )
+        ), True
 
-    def wall(self, curve: Curve, z: float) -> tuple[str, str]:
+    def wall(self, curve: Curve, z: float) -> tuple[str, bool]:
         """Add the upright surface through a curve; return it and whether it points outwards."""
         if isinstance(curve, Line):
-            x, y, _ = _along(curve)
-            axes = self.axes(curve.start, z, (y, -x, 0.0), (x, y, 0.0))
-            return self.add(f"PLANE('',{axes})"), ".T."
+            x, y = curve.end - curve.start
+            normal, outwards = self.direction(np.array([y, -x, 0.0]))
+            along, _ = self.direction(np.array([x, y, 0.0]))
+            return self.add(f"PLANE('',{self.axes(curve.start, z, f'{normal},{along}')})"), outwards
         if isinstance(curve, Arc):
-            axes = self.axes(curve.centre, z, UP, (1.0, 0.0, 0.0))
-            surface = self.add(f"CYLINDRICAL_SURFACE('',{axes},{_real(MM * curve.radius)})")
-            return surface, ".T." if curve.sweep > 0.0 else ".F."
-        swept = self.curve(curve, z)
-        return self.add(f"SURFACE_OF_LINEAR_EXTRUSION('',{swept},{self.vector(UP)})"), ".T."
+            radius = _real(MM * curve.radius)
+            surface = f"CYLINDRICAL_SURFACE('',{self.axes(curve.centre, z)},{radius})"
+            return self.add(surface), curve.sweep > 0.0
+        direction, _ = self.direction(UP)
+        upright = self.add(f"VECTOR('',{direction},1.)")
+        swept, _ = self.curve(curve, z)
+        return self.add(f"SURFACE_OF_LINEAR_EXTRUSION('',{swept},{upright})"), True
 
     def text(self, name: str, file: str, kind: str, item: str) -> str:
         """Return the file of a product with one representation item."""
@@ -198,7 +212,7 @@ class _File:
         stage = add(f"PRODUCT_DEFINITION_CONTEXT('part definition',{application},'design')")
         definition = add(f"PRODUCT_DEFINITION('design','',{formation},{stage})")
         of = add(f"PRODUCT_DEFINITION_SHAPE('','',{definition})")
-        origin = self.axes(np.zeros(2), 0.0, UP, (1.0, 0.0, 0.0))
+        origin = self.axes(np.zeros(2), 0.0)
         representation = add(f"{kind}({title},({origin},{item}),{self._units()})")
         add(f"SHAPE_DEFINITION_REPRESENTATION({of},{representation})")
         head = (
@@ -225,10 +239,8 @@ class _File:
         )
 
 
-def _along(line: Line) -> tuple[float, float, float]:
-    x, y = line.end - line.start
-    size = float(np.hypot(x, y))
-    return float(x) / size, float(y) / size, 0.0
+def _truth(value: bool) -> str:
+    return ".T." if value else ".F."
 
 
 def _real(value: float) -> str:

@@ -251,8 +251,9 @@ def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ByLoads])
         own[k].append(_by_integrals(body, z @ c))
         own[k].append({"K": -z @ np.linalg.solve(body.K, P @ c.T).T})
     y, yd, ydd = (x[instants] for x in motion.unknowns)
-    t = motion.t[instants]
-    by_rates, by_motion, by_bodies = load_gradient(motion.problem, t, (y, yd, ydd), by_c)
+    t, is_corrected = motion.t[instants], motion.feed_forward is not None
+    given = motion.problem, t, (y, yd, ydd), by_c, is_corrected
+    by_rates, by_motion, by_bodies = load_gradient(*given)
     by_rates[0] += motion.by_unknowns(by_q)
 
     def value(moved: Trajectory) -> float:

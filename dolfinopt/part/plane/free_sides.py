@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -12,12 +12,10 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import BodyMesh, PlateMesh, extruded
-from dolfinopt.part.plane.curves import Curve, Line, angle_of, left, unit
+from dolfinopt.part.plane.curves import Line, angle_of, left, unit
 from dolfinopt.part.plane.limits import Limits
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import (
-    Circle,
-    Corner,
     Loop,
     Side,
     Sides,
@@ -171,56 +169,6 @@ class FreeSides:
         # Not centred: its sides turn about the images of the other's middles.
         image = replace(self.sides, loops=tuple(loops), circles=circles)
         return replace(self, part=part, sides=image, repeated=ratio[:, None] * self.sides.ties)
-
-    # -- what a killed search goes on from ---------------------------------------------------
-
-    @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What `restored` makes it of."""
-        rows = [
-            np.hstack(
-                [
-                    (i, side.edge, self._way(side), side.key, side.twin, side.angle, corner.radius),
-                    side.point,
-                    corner.place,
-                ]
-            )
-            for i, loop in enumerate(self.sides.loops)
-            for side, corner in zip(loop.sides, loop.corners, strict=True)
-        ]
-        circles = [[ring.key, ring.twin, *ring.centre, ring.radius] for ring in self.sides.circles]
-        return {"sides": np.array(rows), "circles": np.array(circles).reshape(-1, 5)}
-
-    def _way(self, side: Side) -> int:
-        """Return which of `_ways` of the arm's own curve a side is."""
-        if side.curve is None:
-            return 0
-        t = np.array([0.0, 0.25, 1.0])
-        ways = _ways(self.part.domain.edges[side.edge].curve)
-        return int(np.argmin([np.abs(way.at(t) - side.curve.at(t)).max() for way in ways]))
-
-    def restored(self, arrays: Mapping[str, np.ndarray]) -> FreeSides:
-        """Return the sides of these `arrays`, of those that these have become."""
-        loops = []
-        for i in np.unique(arrays["sides"][:, 0]):
-            sides, corners = [], []
-            for row in arrays["sides"][arrays["sides"][:, 0] == i]:
-                edge, way, key, twin = map(int, row[1:5])
-                own = self.part.domain.edges[edge] if edge >= 0 else None
-                curve, label = (_ways(own.curve)[way], own.label) if own else (None, "")
-                sides.append(Side(row[7:9], float(row[5]), curve, label, edge, key, twin))
-                corners.append(Corner(row[9:], float(row[6])))
-            loops.append(Loop(tuple(sides), tuple(corners)))
-        circles = [
-            Circle(row[2:4], float(row[4]), int(row[0]), int(row[1])) for row in arrays["circles"]
-        ]
-        outline = replace(self.sides, loops=tuple(loops), circles=tuple(circles))
-        return replace(self, sides=outline.centred())
-
-
-def _ways(curve: Curve) -> list[Curve]:
-    """Return a curve of the arm's own as sides may run along it, or along its mirror image."""
-    return [way for item in (curve, curve.mirrored()) for way in (item, item.reversed())]
 
 
 def _stretched(side: Side, factors: np.ndarray) -> Side:

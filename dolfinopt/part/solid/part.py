@@ -120,6 +120,8 @@ class SolidPart:
     @property
     def warnings(self) -> list[str]:
         """What the workshop or the designer should know, a sentence each."""
+        if self.flat is not None:
+            return self.flat.warnings
         domain = self.domain
         lost = domain.left_out_words(self.pieces, self.pieces_volume, 3)
         result = [*domain.gray_words, *lost]
