@@ -162,8 +162,8 @@ def _asymptote_distances(x: Array, width: Array, state: MMAState, widest: float)
     """Return the distances of the asymptotes from x in units of the ranges `width`."""
     if state.iteration < 2:
         return np.full(width.shape, FIRST_ASYMPTOTE_DISTANCE)
-    turned = (x - state.x_old1) * (state.x_old1 - state.x_old2)
-    factor = np.where(turned > 0.0, _WIDEN, np.where(turned < 0.0, _NARROW, 1.0))
+    moves = (x - state.x_old1) * (state.x_old1 - state.x_old2)  # 0 of a variable at rest
+    factor = np.where(moves > 0.0, _WIDEN, np.where(moves < 0.0, _NARROW, 1.0))
     distance = factor * (state.upp - state.low) / (2.0 * width)
     return np.clip(distance, _NEAREST, widest)
 
