@@ -37,6 +37,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.reduction import Basis
 from dolfinopt.scene import load as scenes
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.base import Refusal, input_error
 from dolfinopt.scene.tables.responses import STATICS, needs_alone
 
 # Share of the least change that an optimisation looks at, or of the simulation's tolerance, that
@@ -101,7 +102,10 @@ class Arm:
         self.places = [place for place, owner in enumerate(scene.owners) if owner == index]
         self.solid = scene.material_of(index)
         with profile.phase("mesh"):
-            self.mesh = arm_mesh(comm, arm, None if pattern is None else scene.arms[pattern])
+            try:
+                self.mesh = arm_mesh(comm, arm, None if pattern is None else scene.arms[pattern])
+            except Refusal as refusal:
+                raise input_error(scene.source, refusal.reason) from None
             self.average = average_of(self.mesh, arm)
         self._check_widths(arm)
         with profile.phase("element operators"):
@@ -425,13 +429,14 @@ def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> d
     none.
 
     Raises:
-        InputError: the meshes exceed the memory; a mesh file cannot be an arm, or holds more solid
-            cells than the volume allows.
+        InputError: the meshes exceed the memory; a mesh file cannot be an arm, or an arm have its
+            regions; solid cells take more than the volume allows.
     """
     check_budget(partition.world, scene)
     with together(partition.world):
         arms = {index: Arm(scene, index, partition.comm, profile) for index in partition.arms}
-    if any(scene.arms[index].mesh is not None for index in scene.cell_counts):
+    designed = [scene.arms[index] for index in scene.cell_counts]
+    if any(arm.mesh is not None or arm.regions for arm in designed):
         _check_solid(scene, partition, arms)
     return arms
 
@@ -458,8 +463,8 @@ def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, A
             raise InputError(
                 f"{scene.source}: design.volume_fraction = {limit}: the solid cells are "
                 f"{fraction:.4g} of the volume of {name}, more than that with design.minimum = "
-                f"{least} between them; make group passive smaller, shorten arms.passive or raise "
-                "the volume"
+                f"{least} between them; make group passive or solid arms.regions smaller, shorten "
+                "arms.passive or raise the volume"
             )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -28,9 +28,8 @@ from dolfinopt.mesh.measured import GRID_ROUNDING_SHARE
 from dolfinopt.mesh.solid_cells import add_cells
 from dolfinopt.parallel import on_root, together
 from dolfinopt.scene import load as scenes
-
-if TYPE_CHECKING:
-    from dolfinopt.scene.regions import Cells
+from dolfinopt.scene.regions import Cells, region_cells, region_problem
+from dolfinopt.scene.tables.base import Refusal, shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,8 +136,8 @@ def arm_mesh(comm: MPI.Comm, arm: scenes.Arm, pattern: scenes.Arm | None = None)
         pattern: the arm whose design it repeats, which says what stays solid and void.
 
     Raises:
-        InputError: the mesh file cannot be the arm, or the arm have its regions; compiled forms
-            can be kept nowhere.
+        InputError: the mesh file cannot be the arm; compiled forms can be kept nowhere.
+        Refusal: the arm cannot have its regions.
     """
     with together(comm):
         compat.check_form_cache()
@@ -232,29 +231,27 @@ def with_regions(mesh: ArmMesh, arm: scenes.Arm, scale: Sequence[float]) -> ArmM
         scale: factors (3,) from the mesh's coordinates to the arm's.
 
     Raises:
-        InputError: the arm of a mesh file cannot have them; scenes know it of rectangular ones.
+        Refusal: the arm cannot have them.
     """
     if not arm.regions:
         return mesh
-    from dolfinopt.scene.regions import region_cells, region_problem
-
     centroid = mesh.centroid * scale[: mesh.dim]
-    if arm.mesh is not None and (problem := region_problem(arm, _all_cells(mesh))):
+    if problem := region_problem(arm, _all_cells(mesh, centroid)):
         number, reason = problem
-        raise InputError(f"arm {arm.name!r}: region {number} of arms.regions: {reason}")
+        shape = arm.regions[number].shape
+        value = shown(getattr(arm.regions[number], shape))
+        raise Refusal(f"arms.{arm.name}.regions.{number}.{shape} = {value}: {reason}")
     result = region_cells(arm, centroid)
     return replace(mesh, passive=mesh.passive | result.solid, void=mesh.void | result.void)
 
 
-def _all_cells(mesh: ArmMesh) -> Cells:
+def _all_cells(mesh: ArmMesh, centroid: np.ndarray) -> Cells:
     """Return the cells of all ranks of the arm, on each of them (collective)."""
-    from dolfinopt.scene.regions import Cells
-
     numbering = mesh.mesh.topology.index_map(mesh.mesh.topology.dim)
     pairs = numbering.local_to_global(neighbours(mesh.mesh).ravel().astype(np.int32))
     facets = compat.cell_facets(mesh.mesh, mesh.num_cells)
     mine = (
-        mesh.centroid,
+        centroid,
         mesh.passive,
         np.isin(facets, mesh.inboard_facets).any(axis=1),
         np.isin(facets, mesh.outboard_facets).any(axis=1),

@@ -1,20 +1,12 @@
-"""Which cells the regions of an arm keep solid or void, and whether an arm can have them.
-
-NumPy and SciPy, which scenes without regions do not need.
-"""
+"""Which cells the regions of an arm keep solid or void, and whether its mesh can have them."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from dolfinopt.scene.tables.arms import Arm
-
-# Grids of more cells are left to the check of the memory, which refuses them.
-MOST_CELLS = 30_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,53 +109,3 @@ def _falls_apart(cells: Cells, solid: np.ndarray, void: np.ndarray) -> str | Non
     if not np.isin(piece[solid], joined).all():
         return "solid cells are joined to neither interface"
     return None
-
-
-@lru_cache(maxsize=64)
-def grid_regions(arm: Arm) -> tuple[RegionCells, tuple[int, str] | None]:
-    """Return the cells of a rectangular arm's regions, and `region_problem`."""
-    assert arm.cells is not None
-    counts = _grid(arm)
-    sizes = arm.length, arm.height, arm.thickness
-    corner = 0.0, 0.5, 0.5  # where the frame is, in sizes
-    index = [n.ravel() for n in np.mgrid[tuple(slice(n) for n in counts)]]
-    parts = zip(index, counts, corner, sizes, strict=False)
-    centroid = np.column_stack([((i + 0.5) / n - middle) * size for i, n, middle, size in parts])
-    number = np.arange(len(centroid)).reshape(counts)
-    along, columns = counts[0], arm.passive_columns
-    cells = Cells(
-        centroid=centroid,
-        passive=(index[0] < columns) | (index[0] >= along - columns),
-        inboard=index[0] == 0,
-        outboard=index[0] == along - 1,
-        pairs=np.concatenate(
-            [
-                np.column_stack([n[:-1].ravel(), n[1:].ravel()])
-                for n in (np.moveaxis(number, axis, 0) for axis in range(len(counts)))
-            ]
-        ),
-    )
-    return region_cells(arm, centroid), region_problem(arm, cells)
-
-
-def grid_shares(arm: Arm) -> tuple[float, float]:
-    """Return the shares of a rectangular arm's volume that its regions keep solid and void.
-
-    Solid beside the solid ends.
-    """
-    if arm.n_cells > MOST_CELLS:
-        return 0.0, 0.0
-    assert arm.cells is not None
-    result, _ = grid_regions(arm)
-    along, *others = _grid(arm)
-    columns, across = arm.passive_columns, math.prod(others)
-    inner = result.solid[columns * across : (along - columns) * across]
-    count = along * across
-    return float(inner.sum() / count), float(result.void.sum() / count)
-
-
-def _grid(arm: Arm) -> tuple[int, ...]:
-    """Return cells along, across and, where a region needs it, over the thickness."""
-    assert arm.cells is not None
-    deep = any(region.depth is not None for region in arm.regions)
-    return arm.cells if deep else arm.cells[:2]

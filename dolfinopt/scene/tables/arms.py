@@ -26,7 +26,7 @@ from dolfinopt.scene.tables.base import (
     shown,
     table_in,
 )
-from dolfinopt.scene.tables.design import Region, check_regions
+from dolfinopt.scene.tables.design import Region
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
     Drive,
@@ -507,16 +507,6 @@ class Arm(Drive):
         return 2.0 * self.passive_columns / self.cells[0]
 
     @property
-    def fixed_shares(self) -> tuple[float, float]:
-        """Return the shares of the arm's volume that stay solid and void; 0 for a mesh file."""
-        if self.cells is None or not self.regions:
-            return self.passive_share, 0.0
-        from dolfinopt.scene.regions import grid_shares  # NumPy, which others do not need
-
-        solid, void = grid_shares(self)
-        return self.passive_share + solid, void
-
-    @property
     def cell_size(self) -> float | None:
         """Longest side of a cell, m; None for a mesh file that says it itself."""
         if self.cells is None:
@@ -576,7 +566,6 @@ class Arm(Drive):
             raise Refusal(problem, ".inertia")
         check_interfaces(scene, index)
         check_motor(scene, index)
-        check_regions(self)
         if self.design is not None:
             self._check_design(before)
 

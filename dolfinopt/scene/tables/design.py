@@ -19,7 +19,6 @@ from dolfinopt.scene.tables.base import (
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
-    from dolfinopt.scene.tables.arms import Arm
 
 Projection = Literal[False, "heaviside", "robust", "robust-eroded"]
 # Largest distance of a threshold from 1/2 that is chosen for the wider one of member and gap:
@@ -204,29 +203,21 @@ class Design(Table):
                 raise Refusal(reason, *keys, f"arms.{i}.height")
 
     def _check_volume(self, scene: Scene) -> None:
-        limit = self.volume_fraction
-        if limit is None:
-            return
-        flexible = {i: arm for i, arm in enumerate(scene.arms) if arm.flexible}
+        limit, flexible = (
+            self.volume_fraction,
+            {i: a for i, a in enumerate(scene.arms) if a.flexible},
+        )
+        if limit is None or any(arm.regions for arm in flexible.values()):
+            return  # what regions keep solid their mesh tells
         like = scene.patterns
-        shares = {i: scene.arms[like.get(i, i)].fixed_shares for i in flexible}
+        shares = {i: scene.arms[like.get(i, i)].passive_share for i in flexible}
         if self.shared_volume:
             volumes = {i: a.length * a.height * a.thickness for i, a in flexible.items()}
             volume = sum(volumes.values())
-            solid, void = (sum(shares[i][k] * volumes[i] for i in shares) / volume for k in (0, 1))
-            shares = dict.fromkeys(shares, (solid, void))
-        for i, (share, void) in shares.items():
-            if share + (1.0 - share - void) * self.minimum > limit:
-                if scene.arms[i].regions:
-                    raise Refusal(
-                        f"expected regions with which volume_fraction = {limit} can be met: they "
-                        f"and the solid ends are {share:.4g} of the volume, with design.minimum = "
-                        f"{self.minimum} in the rest; make them smaller or raise the volume "
-                        "fraction",
-                        f"arms.{i}.regions",
-                        f"arms.{i}.passive",
-                        "design.volume_fraction",
-                    )
+            solid = sum(shares[i] * volumes[i] for i in shares) / volume
+            shares = dict.fromkeys(shares, solid)
+        for i, share in shares.items():
+            if share + (1.0 - share) * self.minimum > limit:
                 raise Refusal(
                     f"expected a length with which volume_fraction = {limit} can be met: the solid "
                     f"ends are {share:.4g} of the volume, with design.minimum = {self.minimum} "
@@ -304,23 +295,6 @@ class Region(Table):
         assert self.circle is not None
         middle_x, middle_y, radius = self.circle
         return (x - middle_x) ** 2 + (y - middle_y) ** 2 <= (radius * (1.0 + BORDER)) ** 2
-
-
-def check_regions(arm: Arm) -> None:
-    """Refuse regions that a rectangular arm cannot have; of others the mesh tells.
-
-    Raises:
-        Refusal: its keys are the arm's own.
-    """
-    if not arm.regions or arm.cells is None:
-        return
-    from dolfinopt.scene.regions import MOST_CELLS, grid_regions  # NumPy
-
-    problem = grid_regions(arm)[1] if arm.n_cells <= MOST_CELLS else None
-    if problem is not None:
-        number, reason = problem
-        shape = arm.regions[number].shape
-        raise Refusal(reason, f".regions.{number}.{shape}", ".passive", ".cells")
 
 
 # -- `[interpolation]` ---------------------------------------------------------------------------
