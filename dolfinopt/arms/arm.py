@@ -435,14 +435,12 @@ def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> d
     check_budget(partition.world, scene)
     with together(partition.world):
         arms = {index: Arm(scene, index, partition.comm, profile) for index in partition.arms}
-    designed = [scene.arms[index] for index in scene.cell_counts]
-    if any(arm.mesh is not None or arm.regions for arm in designed):
-        _check_solid(scene, partition, arms)
+    _check_solid(scene, partition, arms)
     return arms
 
 
 def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, Arm]) -> None:
-    """Raise InputError if solid cells exceed the volume limit, unknown to a scene (collective)."""
+    """Raise InputError if solid cells exceed the volume limit (collective)."""
     limit, least = scene.design.volume_fraction, scene.design.minimum
     if limit is None:
         return

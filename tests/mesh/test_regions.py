@@ -117,6 +117,7 @@ def test_regions_belong_to_an_arm_with_cells_and_are_set_as_a_whole():
     most = regions('{kind = "solid", box = [0.1, -0.03, 0.75, 0.03]}')
     refused(["two_arm.toml", "volume_fraction = 0.5", "arms.regions smaller"], most)
     built(most, "design.volume_fraction=0.8")
+    refused(["design.volume_fraction = 0.5", "shorten arms.passive"], "arms.passive=0.26")
     refused(["none with rigid"], f"arms.arm2.regions=[{HOLE}]")
     data = do.load_scene(TWO_ARM, (*SMALL, regions(HOLE))).to_tree()
     assert do.scene_from_dict(data).arms[1].regions == ()

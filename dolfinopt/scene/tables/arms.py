@@ -500,13 +500,6 @@ class Arm(Drive):
         return math.ceil(self.solid_ends / self.length * self.cells[0] - 0.5)
 
     @property
-    def passive_share(self) -> float:
-        """Return the share of the arm's volume that stays solid, in [0, 1]; 0 for a mesh file."""
-        if self.cells is None:
-            return 0.0
-        return 2.0 * self.passive_columns / self.cells[0]
-
-    @property
     def cell_size(self) -> float | None:
         """Longest side of a cell, m; None for a mesh file that says it itself."""
         if self.cells is None:

@@ -163,7 +163,6 @@ class Design(Table):
             return
         self._check_hollow(scene)
         self._check_member_width(scene)
-        self._check_volume(scene)
 
     def _check_hollow(self, scene: Scene) -> None:
         """Refuse what walls have no use for."""
@@ -201,33 +200,6 @@ class Design(Table):
                     )
                 keys = [f".{key}" for key in self.stated_widths]
                 raise Refusal(reason, *keys, f"arms.{i}.height")
-
-    def _check_volume(self, scene: Scene) -> None:
-        limit, flexible = (
-            self.volume_fraction,
-            {i: a for i, a in enumerate(scene.arms) if a.flexible},
-        )
-        if limit is None or any(arm.regions for arm in flexible.values()):
-            return  # what regions keep solid their mesh tells
-        like = scene.patterns
-        shares = {i: scene.arms[like.get(i, i)].passive_share for i in flexible}
-        if self.shared_volume:
-            volumes = {i: a.length * a.height * a.thickness for i, a in flexible.items()}
-            volume = sum(volumes.values())
-            solid = sum(shares[i] * volumes[i] for i in shares) / volume
-            shares = dict.fromkeys(shares, solid)
-        for i, share in shares.items():
-            if share + (1.0 - share) * self.minimum > limit:
-                raise Refusal(
-                    f"expected a length with which volume_fraction = {limit} can be met: the solid "
-                    f"ends are {share:.4g} of the volume, with design.minimum = {self.minimum} "
-                    "between them; shorten passive (0: no solid ends) or raise the volume fraction",
-                    f"arms.{i}.passive",
-                    f"arms.{i}.length",
-                    f"arms.{i}.cells",
-                    "design.volume_fraction",
-                    "design.minimum",
-                )
 
 
 # -- `[[arms.regions]]` --------------------------------------------------------------------------
