@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib import colormaps
+from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path
 
@@ -45,6 +46,7 @@ LABEL_FOOT = 0.6  # inches, for the label of x
 MARGIN = 0.012  # of the arms' length, around them
 FACE = "#b8c4cc"
 CHORD = 0.02  # of drawn curves, cells
+SHADES = 256  # of a scale of colours
 
 
 @styled
@@ -273,13 +275,24 @@ def fill_cells(
     values: np.ndarray,
     colours: str = COLOURS,
     largest: float = 1.0,
+    strength: float = 1.0,
 ) -> None:
-    """Draw cells (n, k, 2) in the colours of their values from 0 to `largest`."""
-    polygons: Any = corners  # as one array: a list would become a path a cell in Python
-    # Blended edges would let the ground shine through between neighbours.
-    cells = PolyCollection(polygons, cmap=colours, antialiaseds=False, lw=0.0, rasterized=True)
-    cells.set_array(values)
-    cells.set_clim(0.0, largest)
+    """Fill cells (n, k, 2) in the colours of their values from 0 to `largest`.
+
+    Cells of one colour are one path: they have no seams, and a path is made for a colour, not for a
+    cell. `strength` is the share of the colours, the rest white: where neighbours overlap by a
+    pixel transparent ones would darken.
+    """
+    levels = np.round(values / largest * (SHADES - 1)).astype(int)
+    shown, paths = np.unique(levels), []
+    codes = np.full(corners.shape[1] + 1, Path.LINETO)
+    codes[[0, -1]] = Path.MOVETO, Path.CLOSEPOLY
+    for level in shown:
+        cells = corners[levels == level]
+        closed = np.concatenate([cells, cells[:, :1]], axis=1)
+        paths.append(Path(closed.reshape(-1, 2), np.tile(codes, len(cells))))
+    fill = 1.0 - strength * (1.0 - colormaps[colours](shown / (SHADES - 1))[:, :3])
+    cells = PathCollection(paths, facecolors=fill, antialiaseds=False, lw=0.0, rasterized=True)
     axes.add_collection(cells, autolim=False)
 
 

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection, PathCollection
-from matplotlib.patches import Polygon
-from matplotlib.path import Path as Shape
+from matplotlib.collections import LineCollection
+from matplotlib.markers import CARETUP
 
 from dolfinopt.multibody.closures import Along, Tie
 from dolfinopt.multibody.tree import GROUND
 from dolfinopt.output.design import ArmView
-from dolfinopt.plots.design import boundary, sides
+from dolfinopt.plots.design import boundary, fill_cells, sides
 from dolfinopt.plots.poses import Poses
 from dolfinopt.plots.style import (
     COLOURS,
@@ -31,10 +30,9 @@ BASE = "#c9c9c9"  # carts, pedestals and sliders
 UNDESIGNED = "#8a8a8a"  # arms without a design
 SIDES = (0.75, 0.95)  # inches left and right of the axes, for y and for the scale of colours
 ROOM = 0.13  # around what is seen, of the arms' reach: for the instants
-CART, TOP = np.array([0.06, 0.045]), 0.25  # half width and height of a cart; top of a pedestal
-BLOCK = np.array([0.06, 0.036])  # half length and half height of a slider
-SHADES = 256  # colours of densities
-THIN, BAR, DOT = 1.0, 5.0, 5.0  # points: lines, rigid arms, joints
+GUIDE = 0.09  # over the arms' reach: by which guides are longer than the way of a slider
+THIN, BAR, DOT, MARK = 1.0, 5.0, 5.0, 18.0  # points: lines, rigid arms, joints, supports
+CART = "s"
 
 
 class PlaneStage:
@@ -64,7 +62,7 @@ class PlaneStage:
         for tie, ends in zip(poses.loops.ties, poses.tied.swapaxes(0, 1), strict=True):
             self._draw_closure(tie, ends)
         if not self.stands:
-            self.axes.axhline(poses.held[0, 0, 1] - CART[1] * size, color=GREY, lw=THIN)
+            self.axes.axhline(poses.held[0, 0, 1], color=GREY, lw=THIN)
         self.keep()
 
     def flat(self, points: np.ndarray) -> np.ndarray:
@@ -80,7 +78,7 @@ class PlaneStage:
         poses = self.poses
         for i, parent in enumerate(poses.parents):
             if parent == GROUND:
-                self._draw_support(poses.held[n, i], not self.stands, strength)
+                self._mark(poses.held[n, i], CARETUP if self.stands else CART, strength)
         for i, view in enumerate(self.views):
             self._draw_arm(i, view, n, strength)
         joints = [*poses.origin[n]]
@@ -103,11 +101,8 @@ class PlaneStage:
             self.axes.plot(*ends.T, color=mixed(UNDESIGNED, strength), lw=BAR)
             return [*ends]
         if (across := _across(tie)) is not None:
-            along = np.array([across[1], -across[0]])
-            ring = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
-            block = ends[0] + ring * BLOCK * self.poses.size @ np.stack([along, across])
-            colour = mixed(BASE, strength)
-            self.axes.add_patch(Polygon(block, fc=colour, ec="black", alpha=0.8, zorder=1.9))
+            turn = 45.0 + np.degrees(np.arctan2(across[1], across[0]))
+            self._mark(ends[0], (4, 0, turn), strength)
         return [ends[0]]
 
     def _draw_arm(self, i: int, view: ArmView, n: int, strength: float) -> None:
@@ -119,65 +114,32 @@ class PlaneStage:
             return
         corners = self.poses.material(view.corners, view.modes, i, n)
         there = view.density > SOLID_FROM
-        self._fill(corners[there], view.density[there], strength)
+        fill_cells(self.axes, corners[there], view.density[there], strength=strength)
         rim = LineCollection(sides(corners)[self.rims[i]], colors=GREY, lw=0.5 * THIN)
         self.axes.add_collection(rim, autolim=False)
 
-    def _fill(self, corners: np.ndarray, density: np.ndarray, strength: float) -> None:
-        """Fill cells (n, k, 2) by their densities; those of one colour are one path.
-
-        So they have no seams, and a path is made for a colour, not for a cell.
-        """
-        levels = np.round(density * (SHADES - 1)).astype(int)
-        shown, paths = np.unique(levels), []
-        codes = np.full(corners.shape[1] + 1, Shape.LINETO)
-        codes[[0, -1]] = Shape.MOVETO, Shape.CLOSEPOLY
-        for level in shown:
-            cells = corners[levels == level]
-            closed = np.concatenate([cells, cells[:, :1]], axis=1)
-            paths.append(Shape(closed.reshape(-1, 2), np.tile(codes, len(cells))))
-        # Paler colours, not transparent ones: where neighbours overlap by a pixel these darken.
-        colours = 1.0 - strength * (1.0 - colormaps[COLOURS](shown / (SHADES - 1))[:, :3])
-        cells = PathCollection(paths, facecolors=colours, antialiaseds=False, lw=0.0)
-        cells.set_rasterized(True)
-        self.axes.add_collection(cells, autolim=False)
-
-    def _draw_support(self, place: np.ndarray, moves: bool, strength: float = 1.0) -> None:
-        """Draw a cart below a joint, or a pedestal on its ground.
-
-        Args:
-            place: (2,) of the joint, m.
-            moves: whether it is a cart.
-            strength: share of its colour.
-        """
-        across, deep = CART * self.poses.size
-        top = across if moves else TOP * across
-        box = np.array([[-across, -deep], [across, -deep], [top, 0.0], [-top, 0.0]])
+    def _mark(self, place: np.ndarray, marker: Any, strength: float = 1.0) -> None:
+        """Draw a cart, a slider or a fixed support at a place (2,), m: Matplotlib's marker."""
         colour = mixed(BASE, strength)
-        self.axes.add_patch(Polygon(place + box, fc=colour, ec="black", zorder=1.5))
-        if not moves:
-            ground = place + np.array([[-2.0 * across, -deep], [2.0 * across, -deep]])
-            self.axes.plot(*ground.T, color=GREY, lw=THIN)
+        self.axes.plot(*place, marker=marker, ms=MARK, mfc=colour, mec="black", zorder=1.5)
 
     def _draw_closure(self, tie: Tie, ends: np.ndarray) -> None:
-        """Draw what stands of a closure with the ground: guide or pedestal.
+        """Draw what stands of a closure with the ground: guide or support.
 
         Args:
             tie: the closure.
             ends: (2, n, 2) places of both its frames at n instants, m.
         """
+        across, point = _across(tie), ends[1][0]
         if tie.b is not None:
             return
-        held, point = ends[0], ends[1][0]
-        if (across := _across(tie)) is None:
-            return self._draw_support(point, moves=False)
-        along, half = np.array([across[1], -across[0]]), BLOCK * self.poses.size
-        s = (held - point) @ along
-        stretch = np.array([s.min() - 1.5 * half[0], s.max() + 1.5 * half[0]])
-        for side in (-half[1], half[1]):
-            guide = point + stretch[:, None] * along + side * across
-            self.axes.plot(*guide.T, color=GREY, lw=THIN)
-        return None
+        if across is None:
+            self._mark(point, CARETUP)
+            return
+        along = np.array([across[1], -across[0]])
+        s, more = (ends[0] - point) @ along, GUIDE * self.poses.size
+        guide = point + np.outer([s.min() - more, s.max() + more], along)
+        self.axes.plot(*guide.T, color=GREY, lw=THIN)
 
     def keep(self) -> None:
         """Keep what has been drawn so far in all frames."""
