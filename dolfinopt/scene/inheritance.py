@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,6 @@ from dolfinopt.scene.tables.joints import DRIVE_KEYS, INBOARD, OF_BEARINGS, OUTB
 from dolfinopt.scene.tables.material import material_keys
 
 Tree = dict[str, Any]
-# Where a body's file waits while arms take meshes from arms before it: it is none.
-BODY = "body from a file"
 DRAWN = 0.01  # m, height and thickness of a rigid arm of no length
 
 
@@ -49,16 +46,25 @@ def inherit(tree: Tree, keys: Iterable[str]) -> set[Loc]:
     """Fill each arm's missing `keys` from the arm before; return their paths."""
     inherited: set[Loc] = set()
     fixed = [row.get("child") for row in rows(tree, "joints") if row.get("type") == "fixed"]
-    for i, (before, arm) in enumerate(pairwise(rows(tree, "arms")), start=1):
+    before: dict[str, Any] = {}
+    for i, arm in enumerate(rows(tree, "arms")):
         taken = {key for keys in _replaced(arm) for key in keys}
         if arm.get("name") in fixed:
             taken.update(key for key in DRIVE_KEYS if key not in OF_BEARINGS)
         for key in keys:
-            if key in before and key not in arm and key not in taken and key not in OWN_KEYS:
+            if (
+                before.get(key) is not None
+                and key not in arm
+                and key not in taken
+                and key not in OWN_KEYS
+            ):
                 arm[key] = copied(before[key])
                 inherited.add(("arms", i, key))
         if ("arms", i, "mesh") in inherited:
             _take_bores(before, arm)
+        mesh, before = before.get("mesh"), dict(arm)
+        if is_sid(arm.get("mesh")):  # a body is no mesh for the arms behind it
+            before["mesh"] = mesh
     return inherited
 
 
@@ -77,13 +83,13 @@ def _replaced(arm: Mapping[str, Any]) -> Iterator[Sequence[str]]:
     """Yield the keys that what an arm states takes the place of."""
     if "cells" in arm:
         yield MESH_KEYS
-    if "mesh" in arm:
+    if "mesh" in arm and not is_sid(arm["mesh"]):
         yield OF_OTHER_MESHES
     if "material" in arm:
         yield material_keys()
     if "kind" in arm:
         yield ["material", *material_keys()]
-    if arm.get("rigid") is True or BODY in arm:
+    if arm.get("rigid") is True or is_sid(arm.get("mesh")):
         yield ("regions",)
     if arm.get("hollow") is False:
         yield WALL_KEYS
@@ -139,21 +145,12 @@ def size_rigid(tree: Tree) -> None:
                 arm.setdefault(key, size)
 
 
-def set_bodies_apart(tree: Tree) -> None:
-    """Keep bodies' files from being taken over by the next arms."""
-    for arm in rows(tree, "arms"):
-        if is_sid(arm.get("mesh")):
-            arm[BODY] = arm.pop("mesh")
-
-
-def put_bodies_back(tree: Tree, inherited: set[Loc]) -> None:
-    """Give arms with a body from a file that in place of what a mesh would need."""
+def drop_of_meshes(tree: Tree, inherited: set[Loc]) -> None:
+    """Leave out what arms with a body from a file took over and only a mesh has."""
     for i, arm in enumerate(rows(tree, "arms")):
-        if BODY in arm:
-            for key in (*PATTERN_KEYS, *MESH_KEYS):
-                if ("arms", i, key) in inherited:
-                    arm.pop(key, None)
-            arm["mesh"] = arm.pop(BODY)
+        for key in (*PATTERN_KEYS, *MESH_KEYS) if is_sid(arm.get("mesh")) else ():
+            if ("arms", i, key) in inherited:
+                arm.pop(key, None)
 
 
 def measure_bodies(tree: Tree, inherited: set[Loc]) -> None:

@@ -98,7 +98,6 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     tree.setdefault("material", {})  # so that the message names the first key missing in it
     check_tables(tree, source)
     told = read_old_words(tree, source)
-    inheritance.set_bodies_apart(tree)
     inherited = inheritance.inherit(tree, Arm.model_fields)
     sizes = {loc for loc in inherited if loc[2] in SIZE_KEYS}
     changes = [override(tree, text, source) for text in overrides]
@@ -108,13 +107,12 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
         inherited.update(change.locs[1:])
     check_tables(tree, source, changes)
     told += read_old_words(tree, source, anew=True)
-    inheritance.set_bodies_apart(tree)
     # An override may have supplied what the first arm lacked; otherwise it changes what it names.
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
     inherited |= inheritance.inherit(tree, required)
     inheritance.size_rigid(tree)
     inheritance.take_from_owners(tree, inherited)
-    inheritance.put_bodies_back(tree, inherited)
+    inheritance.drop_of_meshes(tree, inherited)
     _fill_material(tree, source, changes)
     _resolve_files(tree, source, changes)
     inheritance.drop_sizes(tree, sizes)

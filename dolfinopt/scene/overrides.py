@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from dolfinopt.data import tomllib
-from dolfinopt.scene.inheritance import BODY
 from dolfinopt.scene.messages import (
     Override,
     allowed_words,
@@ -60,7 +59,7 @@ def _drop_replaced(tree: Tree, loc: Loc) -> None:
     if loc == ("material", "name"):
         replaced = material_keys()
     elif loc[0] == "arms":
-        mesh = {"cells": (*MESH_KEYS, BODY), "mesh": ("cells", BODY), "material": material_keys()}
+        mesh = {"cells": MESH_KEYS, "mesh": ("cells",), "material": material_keys()}
         replaced = mesh.get(loc[-1], ())
     for key in replaced:
         (tree["material"] if loc[0] == "material" else tree["arms"][loc[1]]).pop(key, None)
