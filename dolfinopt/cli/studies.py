@@ -18,7 +18,6 @@ from dolfinopt.cli.shared import (
     progress,
     scene_argument,
     start,
-    warn,
 )
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
@@ -234,7 +233,6 @@ def reproduce(
     interrupted goes on.
     """
     world = start()
-    from dolfinopt.output.summary import filter_warnings
     from dolfinopt.paper import reproduction as paper
     from dolfinopt.paper.reproduction import check_paper, failed_checks
     from dolfinopt.parallel import on_root
@@ -243,8 +241,6 @@ def reproduce(
     folder = out or Path("results") / ("paper-fitted" if fitted else "paper")
     overrides = (*(paper.FITTED if fitted else ()), *overrides)
     scene = on_root(world, paper.load_paper, coarse, overrides)
-    if world.rank == 0:
-        warn(filter_warnings(scene, paper.cell_sizes(scene)))
     plan = paper.Plan(scene)
     results, outcomes = paper.reproduce(plan, folder, world)
     checks = check_paper(results)

@@ -29,7 +29,7 @@ def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegral
     Args:
         body: in the plane.
         W: (9, 1 + q, 1 + q) of the body, see `plate_moments`. By default a guess from the planar
-            integrals, all mass on the x axis and moving across it: out of the plane a thin bar.
+            integrals, all mass on the x axis: out of the plane a thin bar.
     """
     if len(body.w) == 3:
         return body
@@ -37,13 +37,8 @@ def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegral
     w, point, K0, loads = np.zeros((3, 1 + q)), np.zeros(3), np.zeros((3, 3, q, q)), body.K0
     w[:2], point[:2] = body.w, body.outboard_point
     if W is None:
-        bar = np.zeros((3, 3, 1 + q, 1 + q))
-        bar[0, 0, 0], bar[0, 0, 1:, 0] = body.W[0, 0], body.W[0, 0, 1:]
-        bar[0, 1, 0, 1:] = bar[1, 0, 1:, 0] = body.W[1, 1:, 0]
-        bar[1, 0, 1:, 1:] = 0.5 * body.W[1, 1:, 1:]
-        bar[0, 1, 1:, 1:] = -bar[1, 0, 1:, 1:]
-        bar[1, 1, 1:, 1:] = body.M
-        W = bar.reshape(9, 1 + q, 1 + q)
+        W = np.zeros((9, 1 + q, 1 + q))
+        W[0], W[1], W[3] = body.W[0], -0.5 * body.W[1], 0.5 * body.W[1]
     if body.is_stiffened:
         push = np.concatenate([body.K0[:2], np.zeros((1, q, q))])
         K0[1, 0], K0[0, 1] = 0.5 * body.K0[2], -0.5 * body.K0[2]

@@ -511,19 +511,6 @@ def _against_contacts(scene: Scene, index: int, size: float) -> str:
     return f"set {', '.join(rest)}{' and ' if rest else ''}{last}, or use finer cells"
 
 
-def filter_warnings(scene: Scene, sizes: Mapping[int, float]) -> list[str]:
-    """Return a sentence where cells are too large for the filter, about the largest ones."""
-    radius, (k, size) = scene.design.radius, max(sizes.items(), key=lambda item: item[1])
-    if radius >= FILTER_CELLS * size * (1.0 - 1e-9):
-        return []
-    return [
-        f"the filter's radius of {radius:.4g} m is {radius / size:.2g} cells of arm "
-        f"{scene.arms[k].name!r}: below {FILTER_CELLS:g} cells parts of a design may be "
-        "connected at corners of cells only, which is stiff in the model alone; set "
-        f"design.filter_radius = {FILTER_CELLS * size:.4g} or more, or use finer cells"
-    ]
-
-
 def _large_deflections(scene: Scene, evaluation: Evaluation) -> Iterator[str]:
     """Yield a sentence on every arm whose deflection is not small, in the scene or a scenario."""
     changes = ["", *(f" with {', '.join(item.changes)}" for item in scene.scenarios)]

@@ -74,11 +74,6 @@ def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
     return load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
 
 
-def cell_sizes(scene: Scene) -> dict[int, float]:
-    """Return the longest side of a cell by arm, m, 0 where a mesh file decides it."""
-    return {k: arm.cell_size or 0.0 for k, arm in enumerate(scene.arms) if arm.flexible}
-
-
 @dataclass(frozen=True)
 class Plan:
     """Everything the paper asks of a scene."""

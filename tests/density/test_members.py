@@ -15,7 +15,7 @@ from dolfinopt.density.members import WIDE, thinnest
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.problem import problem_of
-from dolfinopt.output.summary import _widths, filter_warnings
+from dolfinopt.output.summary import _widths
 
 WORLD = MPI.COMM_WORLD
 CELL = 0.005  # m
@@ -242,15 +242,6 @@ REFUSED = [  # keys changed; key, value and what is expected
 def test_widths_that_cannot_be(overrides, words):
     with refused(*words):
         do.load_scene(TWO_ARM, overrides)
-
-
-@pytest.mark.serial  # ranks have no part in it
-@pytest.mark.parametrize(("radius", "count"), [(0.0075, 1), (0.01, 0), (0.0, 1)])
-def test_a_filter_of_less_than_two_cells_warns(radius, count):
-    scene = do.load_scene(TWO_ARM, (f"design.filter_radius={radius}",))
-    found = filter_warnings(scene, {0: 0.005, 1: 0.005})
-    assert len(found) == count
-    assert all("set design.filter_radius = 0.01 or more" in text for text in found)
 
 
 BORES = ("arms.mesh=meshes/arm_bores.geo", "arms.arm2.design=arm1", "design.projection=robust")

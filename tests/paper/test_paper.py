@@ -15,7 +15,6 @@ from runs import TWO_ARM, overrides, run
 
 from dolfinopt.data import paper_scene
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.output.summary import filter_warnings
 from dolfinopt.paper import reproduction as paper
 from dolfinopt.paper.reproduction import (
     TABLE,
@@ -125,14 +124,9 @@ def test_sentences_follow_from_the_results():
 def test_coarse_cells_get_a_filter_of_two():
     """Below, designs hang together by corners of cells; a filter that is asked for stays."""
     scene = paper.load_paper(True)
-    assert scene.design.radius == pytest.approx(2.0 * max(paper.cell_sizes(scene).values()))
-    assert filter_warnings(scene, paper.cell_sizes(scene)) == []
-    scene = paper.load_paper(True, ["design.filter_radius=0.01"])
-    assert scene.design.radius == 0.01
-    [warning] = filter_warnings(scene, paper.cell_sizes(scene))
-    assert "arm1" in warning and "0.02" in warning  # two cells of 10 mm
-    full = paper.load_paper()  # the paper's scene is fixed: 1.5 of its cells
-    assert full.design.radius == 0.0075 and len(filter_warnings(full, paper.cell_sizes(full))) == 1
+    assert scene.design.radius == pytest.approx(2.0 * scene.arms[0].cell_size)
+    assert paper.load_paper(True, ["design.filter_radius=0.01"]).design.radius == 0.01
+    assert paper.load_paper().design.radius == 0.0075  # the paper's: 1.5 of its cells
 
 
 def test_measures_and_losses():
