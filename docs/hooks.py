@@ -19,7 +19,7 @@ from mkdocs.structure.files import File, Files
 import dolfinopt
 from dolfinopt.bench.field import Value, read_cases
 from dolfinopt.cli import commands
-from dolfinopt.scene.load import describe_keys
+from dolfinopt.scene.messages import describe_keys
 from dolfinopt.scene.old_words import OLD_WORDS
 
 ROOT = Path(__file__).parents[1]

@@ -26,7 +26,7 @@ from runs import ROOT, tomllib
 import dolfinopt
 from dolfinopt.cli import commands
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene.load import describe_keys
+from dolfinopt.scene.messages import describe_keys
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 

@@ -442,9 +442,9 @@ def build_arms(scene: scenes.Scene, partition: Partition, profile: Profile) -> d
 def _check_solid(scene: scenes.Scene, partition: Partition, arms: Mapping[int, Arm]) -> None:
     """Raise InputError if solid cells exceed the volume limit (collective)."""
     limit, least = scene.design.volume_fraction, scene.design.minimum
-    if limit is None:
-        return
     owners = list(scene.cell_counts)
+    if limit is None or not owners:
+        return
     parts = {}
     for k, arm in arms.items():
         weight = scene.owners.count(k) * scene.arms[k].depth

@@ -22,7 +22,7 @@ from dolfinopt.cli.shared import (
 from dolfinopt.data import filled
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import ending_at_once
-from dolfinopt.output.folders import check_new, write_new
+from dolfinopt.output.folders import check_new, write_files
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
 
@@ -83,14 +83,11 @@ def _write_scene(
 
     *_, name = new
     path, kept = folder / name, ", or --overwrite to replace the import; an edited scene is kept"
-    replaced: dict[str, str | bytes]
-    replaced = {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"}
     if overwrite:
         _keep_edited(path, new[name])
-        new, replaced = {}, {**replaced, **new}
     else:
         check_new((folder / item for item in new), kept)
-    write_new(folder, new, replaced)
+    write_files(folder, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n", **new})
     click.echo(filled("imported.txt.jinja", {}, path=path, scene=scene, joints=joints), nl=False)
     try:
         load_scene(path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from math import inf, tau
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import numpy as np
@@ -15,7 +15,7 @@ from scipy.io import savemat
 from dolfinopt.arms.arm import Arm, fixed_body
 from dolfinopt.cli.shared import claim, prepare, scene_of, tell, warn
 from dolfinopt.data import filled
-from dolfinopt.disk import working_in, write_arrays, write_atomically, write_bytes
+from dolfinopt.disk import write_arrays, write_atomically
 from dolfinopt.dynamics.build import check_instant
 from dolfinopt.dynamics.state_space import StateSpace
 from dolfinopt.errors import InputError
@@ -29,17 +29,14 @@ from dolfinopt.interrupt import ending_at_once
 from dolfinopt.loading import load_scene
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.output.design import arms_with_design, under_law_of
-from dolfinopt.output.folders import PARTS, prepare_folder, remove_stale, stale_parts
+from dolfinopt.output.folders import PARTS, remove_stale, stale_parts, write_files
 from dolfinopt.parallel import gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import decide_stiffening
 from dolfinopt.responses.linearised_machine import linearised_machine
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.scene.load import Scene, pose_scenarios
-from dolfinopt.scene.sid import write_sid, write_sid_npz
-
-if TYPE_CHECKING:
-    pass
+from dolfinopt.scene.sid import sid_arrays, write_sid
 
 KINDS = (".sid", ".sid.npz", ".fem")
 
@@ -68,7 +65,7 @@ def export_bodies(
             continue
         data, element = bodies[owner]
         write_sid(folder / f"{arm.name}.sid", data)
-        write_sid_npz(folder / f"{arm.name}.sid.npz", data)
+        write_arrays(folder / f"{arm.name}.sid.npz", sid_arrays(data))
         write_fem(folder / f"{arm.name}.fem", element)
         stiffness = ", geometric stiffness" if len(element.loads) else ""
         click.echo(
@@ -181,11 +178,8 @@ def export_robot(
         if world.rank == 0:
             with ending_at_once():
                 files, said = _robot_files(scene, origin, folder, links)
-            prepare_folder(folder)
-            with working_in(folder):
-                remove_stale(folder, [origin.file.name, *PAGES])
-                for name, data in (pages | files).items():
-                    write_bytes(folder / name, data)  # the robot last: the others belong to it
+            remove_stale(folder, [origin.file.name, *PAGES])
+            write_files(folder, pages | files)  # the robot last: the others belong to it
             click.echo("\n".join([*said, *filter(None, [figures])]))
 
 

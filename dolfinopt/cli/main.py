@@ -26,10 +26,9 @@ from dolfinopt.data import template_folder
 from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import launched_rank
-from dolfinopt.output.folders import write_new
-from dolfinopt.scene.load import describe_keys
+from dolfinopt.output.folders import check_new, write_files
 from dolfinopt.scene.materials import CATALOGUE
-from dolfinopt.scene.messages import KeyInfo
+from dolfinopt.scene.messages import KeyInfo, describe_keys
 from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
 from dolfinopt.scene.tables.base import Refusal
 from dolfinopt.version import __version__
@@ -69,7 +68,8 @@ def init(name: Path, template: str, older: str | None) -> None:
             text = text.replace(f'"{mark}', '"' + json.dumps(value, ensure_ascii=False)[1:-1])
         texts[path.with_suffix(source.suffix).name] = text
     schema = path.with_name(SCHEMA_FILE)
-    write_new(path.parent, texts, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n"})
+    check_new(path.with_name(name) for name in texts)
+    write_files(path.parent, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n", **texts})
     written = ", ".join(os.fspath(path.with_name(name)) for name in texts)
     click.echo(f"{written}: edit the values that differ for your machine")
     click.echo(f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)")

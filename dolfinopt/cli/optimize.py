@@ -70,17 +70,16 @@ def optimize(
         _tell_ahead(world, loaded)
     with working_alone(world, folder):  # until all files of the run are written
         try:
-            with progress(world) as say:
-                most = loaded.optimizer.max_iterations
-                result = run(
-                    loaded,
-                    folder,
-                    resume=resume,
-                    overwrite=overwrite,
-                    world=world,
-                    report=lambda row: say(in_words(row, most)),
-                    compared=True,
-                )
+            say, most = progress(world, "optimize"), loaded.optimizer.max_iterations
+            result = run(
+                loaded,
+                folder,
+                resume=resume,
+                overwrite=overwrite,
+                world=world,
+                report=lambda row: say(in_words(row, most)),
+                compared=True,
+            )
             _conclude(folder, result, plots, verbose)
         except KeyboardInterrupt:
             instead = " in place of --overwrite" if overwrite else ""

@@ -88,21 +88,21 @@ def part(
     claim(world, target, overwrite or resume, names, resume=SHAPES, scene=scene)
     kept = on_root(world, checkpoint_of_search, target, folder, scene, asked)
     known = on_root(world, kept.read) if resume else ()
-    with progress(world) as say:
-        say("outlines and surfaces")
-        wanted = Curves(asked.tool_radius, asked.tolerance, rounds)
-        parts = make_parts(scene, folder, wanted, world)
-        with together(world):
-            if world.rank == 0:
-                warn(dict.fromkeys(text for item in parts.values() for text in item.warnings))
-                done = PartsJob(scene, parts, _meshes(parts, check or bool(asked.optimize), say))
-                done = done.checked(folder, say) if check else done
-                if asked.optimize and done.meshes is not None:
-                    done = done.optimized(folder, asked, check, say, kept.replace, known)
-                say("files")
-                done.write(folder, target, plots)
-                if done.shape is None or not done.shape.interrupted:
-                    kept.remove()
+    say = progress(world, "part")
+    say("outlines and surfaces")
+    wanted = Curves(asked.tool_radius, asked.tolerance, rounds)
+    parts = make_parts(scene, folder, wanted, world)
+    with together(world):
+        if world.rank == 0:
+            warn(dict.fromkeys(text for item in parts.values() for text in item.warnings))
+            done = PartsJob(scene, parts, _meshes(parts, check or bool(asked.optimize), say))
+            done = done.checked(folder, say) if check else done
+            if asked.optimize and done.meshes is not None:
+                done = done.optimized(folder, asked, check, say, kept.replace, known)
+            say("files")
+            done.write(folder, target, plots)
+            if done.shape is None or not done.shape.interrupted:
+                kept.remove()
     if world.rank == 0:
         done.tell(target)
         if done.meshes is None:

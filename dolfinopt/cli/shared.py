@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
 import time
 import traceback
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, redirect_stdout
+from collections.abc import Callable, Collection, Iterable, Sequence
+from contextlib import ExitStack, redirect_stdout
 from functools import partial
 from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
-from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -35,7 +33,7 @@ from dolfinopt.output.folders import (
     prepare_folder,
     stale_parts,
 )
-from dolfinopt.progress import show_slow_work
+from dolfinopt.progress import SlowWork, show_slow_work
 from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
 from dolfinopt.scene.messages import assumed
 from dolfinopt.scene.schema import found_again
@@ -345,48 +343,14 @@ def end_before_start(error: BaseException) -> int:
     return 2 if isinstance(error, InputError) else 1
 
 
-# -- how far a command is: one line, in its place on a terminal, every few seconds elsewhere -----
+# -- how far a command is: a line every few seconds ----------------------------------------------
 
 Say = Callable[[str], None]
-REDRAWN = 0.2  # s from one look of a terminal's line to the next
 
 
-@contextmanager
-def progress(world: MPI.Comm, every: float = 5.0) -> Iterator[Say]:
-    """Yield a function that takes what is being done; the root shows it on the standard error.
-
-    A thread prints, so that long work is not silent either.
-
-    Args:
-        world: all ranks.
-        every: s from one line to the next, where there is no terminal.
-    """
-    if world.rank != 0:
-        yield lambda _: None
-        return
-    live, ended, last = sys.stderr.isatty(), threading.Event(), ["setting up"]
-
-    def run() -> None:
-        while not ended.wait(REDRAWN if live else every):
-            line = f"{last[0]}, {elapsed():.0f} s"
-            if live:  # what else is printed begins where the line does
-                print(f"{line[: get_terminal_size().columns - 1]}\x1b[K", end="\r", file=sys.stderr)
-            else:
-                print(line, file=sys.stderr)
-            sys.stderr.flush()
-
-    def say(words: str) -> None:
-        last[0] = words
-
-    thread = threading.Thread(target=run, name="progress", daemon=True)
-    thread.start()
-    try:
-        yield say
-    finally:
-        ended.set()
-        thread.join()
-        if live:
-            print("\x1b[K", end="", file=sys.stderr, flush=True)
+def progress(world: MPI.Comm, command: str) -> Say:
+    """Return a function that takes what is being done, of which the root tells."""
+    return SlowWork(command).tell if world.rank == 0 else lambda _: None
 
 
 def in_words(row: HistoryRow, iterations: int) -> str:

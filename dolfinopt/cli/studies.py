@@ -338,8 +338,8 @@ def _measure(names: tuple[str, ...], out: Path | None, quick: bool) -> None:
     folder = out or Path("results") / "bench"
     prepare(world, folder)
     plan = Plan(load_paper(overrides=QUICKLY if quick else ()), quick)
-    with progress(world) as say:
-        failures = run(plan, folder, chosen, say, partial(click.echo, err=True))
+    say = progress(world, "bench")
+    failures = run(plan, folder, chosen, say, partial(click.echo, err=True))
     seconds = time.perf_counter() - begun
     click.echo(f"diagrams in {folder}, summary in {folder / 'bench.md'}; {seconds:.0f} s")
     if failures:

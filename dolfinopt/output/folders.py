@@ -185,19 +185,13 @@ def check_new(files: Iterable[Path], hint: str = "") -> None:
             )
 
 
-def write_new(
-    folder: Path, new: Mapping[str, str | bytes], replaced: Mapping[str, str | bytes]
-) -> None:
-    """Write all files of `new`, none of which may be there yet, and those of `replaced`.
-
-    They get into the folder together, the last of all the last.
+def write_files(folder: Path, files: Mapping[str, str | bytes]) -> None:
+    """Write files, which get into the folder together, the last of all the last.
 
     Raises:
-        InputError: one exists, or the folder cannot be written.
+        InputError: the folder cannot be written.
     """
-    check_new(folder / name for name in new)
     prepare_folder(folder)
-    files = {**replaced, **new}
     with written_together(folder, [*files][-1]) as place:
         for name, content in files.items():
             write_bytes(place / name, content if isinstance(content, bytes) else content.encode())

@@ -201,21 +201,14 @@ def check_figure(check: Check, scene: Scene) -> Figure:
 
 # -- drives ----------------------------------------------------------------------------------
 
-# Unit of a quantity, its factors in the order of their size: largest value below which each serves.
 LAW_INSTANTS = 401
-SCALES = {
-    "m": ((1e-3, 1e6, "µm"), (1.0, 1e3, "mm"), (np.inf, 1.0, "m")),
-    "rad": ((0.1, 1e3, "mrad"), (np.inf, 1.0, "rad")),
-    "N": ((1e4, 1.0, "N"), (np.inf, 1e-3, "kN")),
-    "N m": ((1e4, 1.0, "N m"), (np.inf, 1e-3, "kN m")),
-}
 
 
 def drives_figure(trajectory: Trajectory) -> Figure:
     """Return the picture of a machine's drives over time, and of what holds a closed loop.
 
-    A row a drive, its error and its force; then the ground. Errors are q_r - q_r_desired; where no
-    drive can have one, forces stand alone.
+    A row a drive, its error and its force; then the closures. Errors are q_r - q_r_desired; forces
+    stand alone where no drive can have one.
     """
     rows = list(_drive_rows(trajectory))
     columns = max(map(len, rows))
@@ -224,15 +217,13 @@ def drives_figure(trajectory: Trajectory) -> Figure:
 
 
 def _drive_rows(trajectory: Trajectory) -> Iterator[list[Panel]]:
-    """Yield the panels of every drive's error and force, and of the ground's force."""
+    """Yield the panels of every drive's error and force, and of what holds every closed loop."""
 
-    def panel(label: str, unit: str, *curves: np.ndarray, names: Sequence[str] = ("",)) -> Panel:
-        largest = max(float(np.abs(values).max()) for values in curves)
-        factor, shown = next((f, name) for limit, f, name in SCALES[unit] if largest < limit)
-        pairs = zip(names, curves, strict=True)
-        lines = tuple(Line(name, trajectory.t, factor * values) for name, values in pairs)
-        note = f"largest {factor * largest:.3g}"
-        return Panel(f"{label} [{shown}]", TIME, "", lines, y_log=False, note=note)
+    def panel(label: str, unit: str, values: np.ndarray) -> Panel:
+        shown, factor = SHOWN.get(unit, (unit, 1.0))
+        line = Line("", trajectory.t, factor * values)
+        note = f"largest {np.abs(line.y).max():.3g}"
+        return Panel(f"{label} [{shown}]", TIME, "", (line,), y_log=False, note=note)
 
     scene, words = trajectory.scene, {"N": "force", "N m": "moment"}
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
@@ -241,13 +232,7 @@ def _drive_rows(trajectory: Trajectory) -> Iterator[list[Panel]]:
         if name in free:
             row.insert(0, panel(f"{name}: error", scene.rigid_units[name], error[:, k]))
         yield row
-    if (forces := trajectory.closure_force) is None:
-        return
-    if trajectory.closure is not None and forces.shape[1] == 1:
-        yield [panel("normal force on the slider", "N", forces[:, 0])]
-    elif trajectory.closure is not None:
-        yield [panel("force of the pin on the arm", "N", *forces.T, names=("x", "y"))]
-    for name, sizes in trajectory.closure_sizes.items() if trajectory.closure is None else ():
+    for name, sizes in trajectory.closure_sizes.items():
         if name not in scene.driven:  # a driven rod's is its drive's
             yield [panel(f"{name}: {words[unit]}", unit, size) for unit, size in sizes.items()]
 

@@ -173,22 +173,15 @@ def parts_figure(
 
 
 @styled
-def figure_of_plates(parts: Sequence[PlanePart], densities: Sequence[float] = ()) -> Figure:
-    """Return a picture of parts as plates seen from the right and above, to one scale.
-
-    Args:
-        parts: below each other.
-        densities: of their material, kg/m3: captions then tell the masses.
-    """
+def figure_of_plates(parts: Sequence[PlanePart]) -> Figure:
+    """Return a picture of parts as plates below each other, seen from the right and above."""
     from dolfinopt.plots.solid import Surface, surfaces_figure
 
     surfaces, notes = [], []
-    for k, part in enumerate(parts):
+    for part in parts:
         corners = part.facets.reshape(-1, 3)
         surfaces.append(Surface(corners, np.arange(len(corners)).reshape(-1, 3)))
-        mass = [f"mass {densities[k] * part.volume:.3g} kg"] if len(densities) else []
-        holes, curves = len(part.shape.loops) - 1, len(part.shape.curves)
-        notes.append([*mass, f"{holes} holes", f"{curves} curves"])
+        notes.append([f"{len(part.shape.loops) - 1} holes", f"{len(part.shape.curves)} curves"])
     return surfaces_figure([part.name for part in parts], surfaces, notes, "")
 
 

@@ -24,28 +24,19 @@ from dolfinopt.scene.messages import (
     Override,
     blamed,
     check_tables,
-    describe_keys,
     dotted,
     first_problem,
 )
 from dolfinopt.scene.old_words import read_old_words
 from dolfinopt.scene.overrides import override
-from dolfinopt.scene.schema import FILE_KEYS, Scene, check_scene_name, named_files
-from dolfinopt.scene.tables.arms import MAX_CELLS, SIZE_KEYS, Arm
+from dolfinopt.scene.schema import Scene, check_scene_name, named_files
+from dolfinopt.scene.tables.arms import SIZE_KEYS, Arm
 from dolfinopt.scene.tables.base import Refusal, input_error, loc_of, shown
-from dolfinopt.scene.tables.design import Law
-from dolfinopt.scene.tables.motion import Motion, Reduction
 from dolfinopt.scene.toml import read_toml
 
 __all__ = [
-    "FILE_KEYS",
-    "MAX_CELLS",
     "Arm",
-    "Law",
-    "Motion",
-    "Reduction",
     "Scene",
-    "describe_keys",
     "pose_scenarios",
     "read_scene",
     "resolve_file",

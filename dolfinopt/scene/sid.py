@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 
 from dolfinopt.data import filled
-from dolfinopt.disk import write_arrays, write_text
+from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
 
 Items = dict[str, Callable[[], Any]]  # how the items of a block are read
@@ -218,11 +218,6 @@ def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
         if matrix is not None:
             arrays |= {f"{name}/{key}": np.asarray(value) for key, value in vars(matrix).items()}
     return arrays
-
-
-def write_sid_npz(path: Path, data: StandardInputData) -> None:
-    """Write `sid_arrays` to a file."""
-    write_arrays(path, sid_arrays(data))
 
 
 # -- writing the text file ---------------------------------------------------------------------

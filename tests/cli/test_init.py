@@ -14,8 +14,8 @@ import dolfinopt
 from dolfinopt.cli.main import TEMPLATES
 from dolfinopt.data import template_folder
 from dolfinopt.dynamics.build import check_motion
-from dolfinopt.scene.load import describe_keys, read_scene
-from dolfinopt.scene.messages import implausible
+from dolfinopt.scene.load import read_scene
+from dolfinopt.scene.messages import describe_keys, implausible
 from dolfinopt.scene.schema import scene_schema
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks

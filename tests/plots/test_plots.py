@@ -230,14 +230,14 @@ def test_drives_have_a_row_each_and_the_ground_one():
         titles[name] = [axes.get_title(loc="left") for axes in figure.axes]
         shown(figure)
         if name == "control":
-            error = 1e6 * (trajectory.q_r - trajectory.desired.q)[:, 0]
+            error = 1e3 * (trajectory.q_r - trajectory.desired.q)[:, 0]
             np.testing.assert_allclose(figure.axes[0].lines[0].get_ydata(), error, atol=1e-9)
             force = trajectory.joint_forces[:, 0]
             np.testing.assert_allclose(figure.axes[1].lines[0].get_ydata(), force)
             assert figure.axes[1].get_title(loc="right") == f"largest {np.abs(force).max():.3g}"
-    assert titles["control"][:2] == ["cart: error [µm]", "cart: force [N]"]
+    assert titles["control"][:2] == ["cart: error [mm]", "cart: force [N]"]
     assert len(titles["control"]) == 2 * len(GAINS["stiffness"])
-    assert titles["loop"][1:] == ["crank: moment [N m]", "normal force on the slider [N]"]
-    assert titles["pin"] == ["crank: moment [N m]", "force of the pin on the arm [N]"]
+    assert titles["loop"][1:] == ["crank: moment [N m]", "closure: force [N]"]
+    assert titles["pin"] == ["crank: moment [N m]", "closure: force [N]"]
     # A cart that follows the desired motion exactly has no error to be shown.
     assert titles["soft"][0] == "cart: force [N]" and len(titles["soft"]) == 5

@@ -12,7 +12,8 @@ from runs import TWO_ARM
 import dolfinopt as do
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.scene.load import describe_keys, read_scene, scene_from_dict
+from dolfinopt.scene.load import read_scene, scene_from_dict
+from dolfinopt.scene.messages import describe_keys
 
 pytestmark = pytest.mark.serial  # a hundred small runs
 

@@ -11,16 +11,9 @@ from runs import TWO_ARM, refusal
 from scenes import ARM, FILE, MATERIAL, changed, minimal, refused
 
 from dolfinopt.errors import InputError
-from dolfinopt.scene.load import (
-    MAX_CELLS,
-    Arm,
-    Scene,
-    describe_keys,
-    pose_scenarios,
-    read_scene,
-    scene_from_dict,
-)
-from dolfinopt.scene.messages import implausible
+from dolfinopt.scene.load import Arm, Scene, pose_scenarios, read_scene, scene_from_dict
+from dolfinopt.scene.messages import describe_keys, implausible
+from dolfinopt.scene.tables.arms import MAX_CELLS
 from dolfinopt.scene.tables.objective import Constraints, Objective
 from dolfinopt.scene.tables.responses import DECLARED
 

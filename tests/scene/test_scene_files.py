@@ -12,14 +12,8 @@ from scenes import ARM, FILE, MATERIAL, changed, minimal, refused
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
-from dolfinopt.scene.load import (
-    Arm,
-    Scene,
-    describe_keys,
-    read_scene,
-    resolve_file,
-    scene_from_dict,
-)
+from dolfinopt.scene.load import Arm, Scene, read_scene, resolve_file, scene_from_dict
+from dolfinopt.scene.messages import describe_keys
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
 

@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -251,19 +251,16 @@ SHORTEST = 1e-3  # m of a solid
 PARALLEL = 1e-6  # sine of the angle between axes
 
 
-@dataclass(frozen=True, eq=False)
-class Solid:
-    """A solid's frame in its link's, its length, and the sides of its box."""
+class Solid(NamedTuple):
+    """A solid's frame in its link's, its length, the sides of its box, and how they are known.
+
+    Of a rigid body the frame of its link alone; see `SceneBody`.
+    """
 
     frame: np.ndarray
-    length: float
-    size: tuple[float, float]
-    measured: bool
-
-    @property
-    def outboard(self) -> np.ndarray:
-        """Pose of the outboard interface in the frame of the link."""
-        return self.frame @ pose_of(np.eye(3), np.array([self.length, 0.0, 0.0]))
+    length: float = 0.0
+    size: tuple[float, float] | None = None
+    measured: bool = False
 
 
 def solid_of(robot: Robot, name: str, tool: str) -> Solid:
@@ -354,10 +351,10 @@ class SceneBody:
         links: names of all links it consists of.
         joint: that holds it.
         parent: link of the body it hangs on, or `GROUND`.
-        frame: T, its frame in the link's.
         pose: of the joint's frame in the parent's outboard interface frame.
         axis: (3,) of the joint in its frame.
         inertia: in its frame; of a solid what the file says, without what is fixed to it.
+        frame: T, its frame in the link's.
         length: from its frame to the outboard interface along x, m; 0 of a rigid one.
         size: height and thickness of a solid, m; None of a rigid body.
         measured: whether these are the extents of the link's geometry.
@@ -368,10 +365,10 @@ class SceneBody:
     links: tuple[str, ...]
     joint: RobotJoint
     parent: str
-    frame: np.ndarray
     pose: np.ndarray
     axis: np.ndarray
     inertia: Inertia
+    frame: np.ndarray
     length: float = 0.0
     size: tuple[float, float] | None = None
     measured: bool = False
@@ -381,6 +378,11 @@ class SceneBody:
     def is_solid(self) -> bool:
         """Whether it is one of the chosen links."""
         return self.size is not None
+
+    @property
+    def outboard(self) -> np.ndarray:
+        """Pose of the outboard interface in the frame of the link."""
+        return self.frame @ pose_of(np.eye(3), np.array([self.length, 0.0, 0.0]))
 
 
 def scene_bodies(
@@ -399,29 +401,28 @@ def scene_bodies(
     _check_links(robot, chosen, tool)
     tool = tool or default_tool(robot, chosen)
     places = places_of(robot, chosen, tool)
-    solids = {name: solid_of(robot, name, tool) for name in chosen}
-    bodies = []
+    bodies: dict[str, SceneBody] = {}
     for link, (body, _) in places.items():
         if link != body:
             continue
-        joint, solid = robot.holder[link], solids.get(link)
+        solid = solid_of(robot, link, tool) if link in chosen else Solid(np.eye(4))
+        joint, frame = robot.holder[link], solid.frame
         parent, at = places[joint.parent]
-        frame = np.eye(4) if solid is None else solid.frame
-        outboard = solids[parent].outboard if parent in solids else np.eye(4)
+        outboard = bodies[parent].outboard if parent in bodies else np.eye(4)
         links = tuple(name for name, (other, _) in places.items() if other == link)
-        total = robot.links[link].own if solid else MASSLESS
-        for name in () if solid else links:
+        total = MASSLESS
+        for name in (link,) if solid.size else links:
             total = total + robot.links[name].own.posed(places[name][1])
         pose, axis = inverse(outboard) @ at @ joint.pose @ frame, frame[:3, :3].T @ joint.axis
-        own = (solid.length, solid.size, solid.measured) if solid else ()
         inertia = total.posed(inverse(frame))
-        bodies.append(SceneBody(link, links, joint, parent, frame, pose, axis, inertia, *own))
-    if any(item.parent == tool for item in bodies):
+        bodies[link] = SceneBody(link, links, joint, parent, pose, axis, inertia, *solid)
+    if any(item.parent == tool for item in bodies.values()):
         # A body without mass at the outboard interface of a tool on which others hang.
         name, still = f"{tool}_end", np.eye(4)
         joint = RobotJoint(name, "fixed", tool, name, still, still[0, :3])
-        return (*bodies, SceneBody(name, (), joint, tool, still, still, joint.axis, MASSLESS))
-    return tuple(sorted(bodies, key=lambda item: item.link == tool))
+        end = SceneBody(name, (), joint, tool, still, joint.axis, MASSLESS, still)
+        return (*bodies.values(), end)
+    return tuple(sorted(bodies.values(), key=lambda item: item.link == tool))
 
 
 def _check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> None:
@@ -600,12 +601,10 @@ class _Reader:
         if link not in self.places:
             raise _refused(self.file, key, link, f"expected links: {', '.join(self.places)}")
         body, pose = self.places[link]
-        if body == GROUND or not self.bodies[body].is_solid:
+        if body == GROUND:
             return body, pose @ at
-        solid = self.bodies[body]
-        end = solid.frame @ pose_of(np.eye(3), np.array([solid.length, 0.0, 0.0]))
-        result = inverse(end) @ pose @ at
-        if np.linalg.norm(result[:3, 3]) > SAME_PLACE:
+        result = inverse(self.bodies[body].outboard) @ pose @ at
+        if self.bodies[body].is_solid and np.linalg.norm(result[:3, 3]) > SAME_PLACE:
             raise _refused(
                 self.file,
                 key,
