@@ -1,12 +1,11 @@
 """A link's geometry, mended, as hexahedra between its joints, in the arm's frame.
 
-Meshes of robots are made for pictures and collisions: open, in many pieces, inside out. What they
-enclose is therefore found on a grid. A piece that is closed fills what lies within it; holes of an
-open one are closed by VTK (pyvista's `fill_holes`). What that leaves open is filled on a grid
+Meshes of robots are made for pictures and collisions: open, in many pieces, inside out. Holes of an
+open piece are closed by VTK (pyvista's `fill_holes`). What that leaves open is filled on a grid
 within its surface after a morphological closing (Serra, Image Analysis and Mathematical Morphology,
-1982), whose contour is a closed piece. Their union is cut at the joints; of its pieces the largest
-stays. Cubes that are at least half full are the cells, and their outer corners are moved onto the
-surface.
+1982), whose contour is a closed piece. The closed pieces are united (manifold3d, by trimesh), and
+cut at the joints; of the bodies the largest stays. Cubes that are at least half full are the cells,
+and their outer corners are moved onto the surface.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 MOST = 20000  # of one with thin walls
 FINE = 3  # voxels along the side of a cell
 VOXELS = 1e7  # of a link, at most
-COARSE = 64  # voxels along a link where its volume is estimated
 MANY = 300  # pieces of a surface from which on it is filled as it is, not piece by piece
 TINY = 0.02  # of the link's size: smaller pieces (screws, labels) are left out
 SHELL = 128  # voxels along a link on which open pieces are filled
@@ -143,81 +141,28 @@ class _Grid:
         return result
 
 
-@dataclass(frozen=True, eq=False)
-class _Pieces:
-    """The closed pieces of a link's surface in the arm's frame, and what was done to close them."""
-
-    closed: tuple[Trimesh, ...]
-    hollows: tuple[Trimesh, ...]
-    done: tuple[str, ...]
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """Lowest and highest corner (2, 3) of the box around them, m."""
-        return _bounds(self.closed)
-
-    @property
-    def wall(self) -> float:
-        """Mean thickness of what is between surfaces, 2 V / A, m: of a hollow link, of its wall."""
-        volume = sum(piece.volume for piece in self.closed)
-        volume -= sum(piece.volume for piece in self.hollows)
-        return float(2.0 * volume / sum(piece.area for piece in (*self.closed, *self.hollows)))
-
-    def on(self, grid: _Grid) -> np.ndarray:
-        """Return True for the voxels within the geometry."""
-        result = _filled(grid, self.closed)
-        for piece in self.hollows:
-            result &= ~grid.filled_by(piece)
-        return result
-
-    def nearest(self, points: np.ndarray, near: float) -> np.ndarray:
-        """Return the nearest points (n, 3) of the surface; themselves where that is not near, m."""
-        distance, result = np.full(len(points), near), points.copy()
-        for pieces, sign in ((self.closed, 1.0), (self.hollows, -1.0)):
-            for piece in pieces:
-                low, high = piece.bounds
-                at = np.flatnonzero(((points > low - near) & (points < high + near)).all(axis=1))
-                own, places = _distance(piece, points[at])
-                nearer = sign * (sign * own - distance[at]) < 0.0
-                at = at[nearer]
-                distance[at], result[at] = sign * own[nearer], places[nearer]
-        return result
-
-
-def _bounds(pieces: Sequence[Trimesh]) -> np.ndarray:
-    every = np.array([piece.bounds for piece in pieces])
-    return np.stack([every[:, 0].min(axis=0), every[:, 1].max(axis=0)])
-
-
-def _filled(grid: _Grid, closed: Sequence[Trimesh]) -> np.ndarray:
-    """Return True for the voxels within closed pieces."""
-    result = np.zeros(grid.shape, dtype=bool)
-    for piece in closed:
-        result |= grid.filled_by(piece)
-    return result
-
-
-def _distance(closed: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return signed distances (n,) from a closed surface, negative inside, and nearest points."""
+def _nearest_places(solid: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances (n,) from a surface, m, and the nearest places (n, 3) on it."""
     import pyvista
 
-    if not len(points):
-        return np.zeros(0), np.zeros((0, 3))
-    surface: Any = pyvista.wrap(closed)
-    result = pyvista.PolyData(points).compute_implicit_distance(surface)
-    _, nearest = surface.find_closest_cell(points, return_closest_point=True)
-    return np.asarray(result["implicit_distance"]), np.asarray(nearest)
+    surface: Any = pyvista.wrap(solid)
+    _, places = surface.find_closest_cell(points, return_closest_point=True)
+    return np.linalg.norm(points - places, axis=1), np.asarray(places)
 
 
 def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]:
     """Return the closed surface of what open pieces enclose, together with closed ones; or none."""
     import trimesh
 
-    low, high = _bounds([*left, *closed])
+    corners = np.vstack([piece.bounds for piece in (*left, *closed)])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     step, radius = float((high - low).max()) / SHELL, round(GAP * SHELL)
-    margin = (radius + 1) * step
-    grid = _grid(low - margin, high + margin, step)
-    shell = _filled(grid, closed)
+    margin = (radius + 2) * step  # a closing needs it, and an opening
+    along, over, through = map(int, np.ceil((high - low + 2.0 * margin) / step))
+    grid = _Grid(low - margin, step, (along, over, through))
+    shell = np.zeros(grid.shape, dtype=bool)
+    for piece in closed:
+        shell |= grid.filled_by(piece)
     for piece in left:
         shell |= grid.passed_by(piece)
     shell = ndimage.binary_dilation(shell, iterations=radius)
@@ -248,37 +193,38 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
     Raises:
         NoSolid: there is no geometry, it encloses nothing, or is too thin for cells.
     """
-    pieces = _pieces(shapes, inverse(body.frame))
-    piece = _largest(pieces)
-    notes, ends = list(pieces.done), _ends(piece.box, body.length)
-    between = None if ends is None else _between(pieces, piece, ends)
-    if ends is not None and between is not None and between.volume > BETWEEN * piece.volume:
-        piece = between
+    solid, notes = _united(shapes, inverse(body.frame))
+    piece, share = _largest(solid)
+    ends = _ends(piece, body.length)
+    if ends is not None and (cut := _between(piece, ends)):
+        piece, share = cut[0], share * cut[1]
         notes += _shortened(ends, body.length)
     else:
         notes.append("not cut at the joints: rigid where it is nearest to them")
         ends = None
-    away = max(piece.away(x) for x in (0.0, body.length))
-    if away > NEAR * max(piece.size, body.length):
+    joints = np.array([[0.0, 0.0, 0.0], [body.length, 0.0, 0.0]])
+    away = float(_nearest_places(piece, joints)[0].max())
+    if away > NEAR * max(np.ptp(piece.bounds, axis=0).max(), body.length):
         raise NoSolid(f"its geometry is {away:.3g} m away from a joint")
-    if piece.share < KEPT_ALL:
-        notes.append(f"the largest part kept, {100.0 * piece.share:.3g} % of it")
+    if share < KEPT_ALL:
+        notes.append(f"the largest part kept, {100.0 * share:.3g} % of it")
     count = CELLS
     while count <= MOST:
-        side = (piece.volume / count) ** (1.0 / 3.0)
-        cells = _cells(pieces, piece.box, ends, side, body.length, notes)
+        side = float(np.cbrt(piece.volume / count))
+        cells = _cells(solid, piece, ends, side, body.length, notes)
         if cells is not None:
-            return replace(cells, done=(*cells.done, *_thin_walls(pieces, cells)))
+            return replace(cells, done=(*cells.done, *_thin_walls(solid, cells)))
         count = round(1.5 * count)
     raise NoSolid(f"its walls are too thin for {MOST} cells")
 
 
-def _thin_walls(pieces: _Pieces, cells: LinkCells) -> list[str]:
+def _thin_walls(solid: Trimesh, cells: LinkCells) -> list[str]:
     """Return that walls are thinner than cells, which then lose pieces and volume."""
-    if pieces.wall >= cells.side:
+    wall = 2.0 * solid.volume / solid.area  # its mean thickness
+    if wall >= cells.side:
         return []
     return [
-        f"its walls, about {1e3 * pieces.wall:.2g} mm, are thinner than its cells of "
+        f"its walls, about {1e3 * wall:.2g} mm, are thinner than its cells of "
         f"{1e3 * cells.side:.2g} mm, which lose part of them: arms.hollow is made for such links"
     ]
 
@@ -286,8 +232,10 @@ def _thin_walls(pieces: _Pieces, cells: LinkCells) -> list[str]:
 # -- pieces ----------------------------------------------------------------------------------
 
 
-def _pieces(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> _Pieces:
-    """Return the pieces of surfaces, transformed, with their holes closed."""
+def _united(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> tuple[Trimesh, list[str]]:
+    """Return what surfaces enclose, transformed, as one, and what was done to close them."""
+    from trimesh import boolean
+
     if not shapes:
         raise NoSolid("it has no geometry")
     closed: list[Trimesh] = []
@@ -314,7 +262,7 @@ def _pieces(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> _Pieces:
                     hollows.append(piece)
                 else:
                     turned += int(_turn_outwards(piece))
-                    closed.append(piece)
+                    (closed if piece.is_volume else left).append(piece)
             elif (mended := _with_holes_closed(piece)) is not None:
                 filled += 1
                 closed.append(mended)
@@ -333,7 +281,10 @@ def _pieces(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> _Pieces:
     closed += _within(left, closed) if left else []
     if not closed:
         raise NoSolid("its geometry encloses nothing")
-    return _Pieces(tuple(closed), tuple(hollows), tuple(w for n, w in said if n))
+    solid = boolean.union(closed, check_volume=False)
+    if hollows:
+        solid = boolean.difference([solid, *hollows], check_volume=False)
+    return solid, [words for count, words in said if count]
 
 
 def _pieces_of(count: int) -> str:
@@ -393,105 +344,50 @@ def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
 # -- where it is cut -------------------------------------------------------------------------
 
 
-def _grid(low: np.ndarray, high: np.ndarray, step: float) -> _Grid:
-    """Return a grid about a box, in the middle of it across the arm, with two voxels around."""
-    count = np.ceil((high - low) / step - 1e-6).astype(int) + 4
-    start = 0.5 * (low + high) - 0.5 * count * step
-    start[0] = low[0] - 2.0 * step
-    return _Grid(start, step, (int(count[0]), int(count[1]), int(count[2])))
-
-
-def _region(
-    pieces: _Pieces, grid: _Grid, ends: tuple[float, float] | None
-) -> tuple[np.ndarray, float]:
-    """Return the largest piece between the ends on a grid, and its share of what is there."""
-    result = pieces.on(grid)
-    if ends is not None:
-        x = grid.low[0] + (np.arange(grid.shape[0]) + 0.5) * grid.step
-        result[(x < ends[0]) | (x > ends[1])] = False
-    if not result.any():
-        return result, 0.0
-    largest = _connected(result)
-    return largest, float(largest.sum() / result.sum())
-
-
 def _connected(mask: np.ndarray) -> np.ndarray:
     """Return the largest connected part of what is True."""
     labels, _ = ndimage.label(mask)
     return np.asarray(labels == 1 + int(np.bincount(labels.ravel())[1:].argmax()))
 
 
-def _ends(box: np.ndarray, length: float) -> tuple[float, float] | None:
-    """Return where along x the geometry is cut; None where it hardly lies between its joints."""
-    low, high = float(box[0, 0]), float(box[1, 0])
+def _ends(link: Trimesh, length: float) -> np.ndarray | None:
+    """Return where along x (2,) a link is cut; None where it hardly lies between its joints."""
+    low, high = link.bounds[:, 0]
     margin = MARGIN * length
     first = 0.0 if low < 1e-3 * length else low + margin
     last = length if high > (1.0 - 1e-3) * length else high - margin
-    return (first, last) if last - first > SHORTEST * length else None
+    return np.array([first, last]) if last - first > SHORTEST * length else None
 
 
-@dataclass(frozen=True, eq=False)
-class _Piece:
-    """The largest piece of a link on a coarse grid, its share; its box (2, 3) to a voxel."""
+def _largest(solid: Trimesh) -> tuple[Trimesh, float]:
+    """Return the largest body of a solid, with its cavities, and its share of the volume."""
+    import trimesh
 
-    region: np.ndarray
-    share: float
-    grid: _Grid
-    box: np.ndarray
-
-    @property
-    def volume(self) -> float:
-        return float(self.region.sum()) * self.grid.step**3
-
-    @property
-    def size(self) -> float:
-        return float(np.ptp(self.box, axis=0).max())
-
-    def away(self, x: float) -> float:
-        """Return the distance from a joint at (x, 0, 0), m."""
-        middles = self.grid.low + (np.argwhere(self.region) + 0.5) * self.grid.step
-        return float(np.linalg.norm(middles - [x, 0.0, 0.0], axis=1).min())
+    parts = list(solid.split(only_watertight=False, repair=False))
+    outer = max(parts, key=lambda part: float(part.volume))
+    inner = [part for part in parts if part.volume < 0.0 and _lies_in_another(part, [outer])]
+    body: Any = trimesh.util.concatenate([outer, *inner])
+    return body, float(body.volume / solid.volume)
 
 
-def _piece(region: np.ndarray, share: float, grid: _Grid, box: np.ndarray) -> _Piece:
-    """Return a piece with its box, within that of what was looked at."""
-    where = np.argwhere(region)
-    # Half a voxel is lost where a surface passes beyond the middles of voxels.
-    lost = grid.step * np.array([0.0, 1.0, 1.0])
-    low = grid.low + where.min(axis=0) * grid.step - lost
-    high = grid.low + (where.max(axis=0) + 1) * grid.step + lost
-    within = np.stack([np.maximum(low, box[0]), np.minimum(high, box[1])])
-    return _Piece(region, share, grid, within)
+def _between(link: Trimesh, ends: np.ndarray) -> tuple[Trimesh, float] | None:
+    """Return the body that leads from one end to the other, and its share of what lies there.
 
+    None without one, and where most of the link lies elsewhere.
+    """
+    from trimesh import boolean, creation
 
-def _largest(pieces: _Pieces) -> _Piece:
-    """Return the largest piece; looked at again where it is much smaller than what there is."""
-    box, share = pieces.bounds, 1.0
-    for _ in range(4):
-        size = float(np.ptp(box, axis=0).max())
-        grid = _grid(box[0], box[1], size / COARSE)
-        region, now = _region(pieces, grid, None)
-        share = min(share, now)
-        result = _piece(region, share, grid, box)
-        if result.size > 0.7 * size:
-            break
-        box = result.box
-    return result
-
-
-def _between(pieces: _Pieces, link: _Piece, ends: tuple[float, float]) -> _Piece | None:
-    """Return the piece that leads from one end to the other; None without one."""
-    box = link.box.copy()
-    box[:, 0] = ends
-    along = ends[1] - ends[0]
-    grid = _grid(box[0], box[1], along / max(8, round(along / link.grid.step)))
-    region, share = _region(pieces, grid, ends)
-    if share < WHOLE or not (region[2].any() and region[-3].any()):
+    wider = link.bounds + np.array([[-1.0], [1.0]])
+    wider[:, 0] = ends
+    cut = boolean.intersection([link, creation.box(bounds=wider)], check_volume=False)
+    if cut.volume <= BETWEEN * link.volume:
         return None
-    return _piece(region, share * link.share, grid, box)
+    body, share = _largest(cut)
+    leads = np.allclose(body.bounds[:, 0], ends, atol=1e-3 * np.ptp(ends))
+    return (body, share) if leads and share >= WHOLE else None
 
 
-def _shortened(ends: tuple[float, float], length: float) -> list[str]:
+def _shortened(ends: np.ndarray, length: float) -> list[str]:
     """Return a sentence for every end at which the geometry does not reach its joint."""
     gaps = (("inboard", ends[0]), ("outboard", length - ends[1]))
     return [f"ends {gap:.3g} m before the {name} joint" for name, gap in gaps if gap > 0.0]
@@ -501,34 +397,34 @@ def _shortened(ends: tuple[float, float], length: float) -> list[str]:
 
 
 def _cells(
-    pieces: _Pieces,
-    box: np.ndarray,
-    ends: tuple[float, float] | None,
+    solid: Trimesh,
+    piece: Trimesh,
+    ends: np.ndarray | None,
     side: float,
     length: float,
     notes: Sequence[str],
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
-    low, high = box
+    low, high = piece.bounds
     side = min(side, float((high - low)[1:].min()) / FEWEST)
     if ends is not None:
         side = (ends[1] - ends[0]) / max(FEWEST, round((ends[1] - ends[0]) / side))
-    blocks = np.ceil((high - low) / side - 1e-6).astype(int)
+    blocks = np.maximum(1.0, np.rint((high - low) / side)).astype(int)
     start = 0.5 * (low + high) - 0.5 * blocks * side
     if blocks.prod() * FINE**3 > VOXELS:
         return None
     along, over, through = (int(FINE * n) for n in blocks)
     fine = _Grid(start, side / FINE, (along, over, through))
-    region, _ = _region(pieces, fine, ends)
+    region = fine.filled_by(piece)
     pooled = region.reshape(blocks[0], FINE, blocks[1], FINE, blocks[2], FINE).mean(axis=(1, 3, 5))
     if not (pooled >= FULL).any():
         return None
-    solid = _connected(pooled >= FULL)
-    if not KEPT * pooled.sum() <= solid.sum() <= 2 * MOST:
+    full = _connected(pooled >= FULL)
+    if not KEPT * pooled.sum() <= full.sum() <= 2 * MOST:
         return None
-    if ends is not None and not (solid[0].any() and solid[-1].any()):
+    if ends is not None and not (full[0].any() and full[-1].any()):
         return None
-    where = np.argwhere(solid)
+    where = np.argwhere(full)
     corners = (where[:, None] + CORNERS).reshape(-1, 3)
     nodes, cells = np.unique(corners, axis=0, return_inverse=True)
     cells = cells.reshape(-1, 8)
@@ -540,7 +436,7 @@ def _cells(
     else:
         patches = _nearest(points, facets, length)
     held = [np.unique(patch) for patch in patches]
-    points = _on_surface(pieces, points, cells, facets, side, held if ends is not None else [])
+    points = _on_surface(solid, points, cells, facets, side, held if ends is not None else [])
     return LinkCells(points, cells, patches[0], patches[1], side, tuple(notes))
 
 
@@ -560,7 +456,7 @@ def _nearest(points: np.ndarray, facets: np.ndarray, length: float) -> list[np.n
 
 
 def _on_surface(
-    pieces: _Pieces,
+    solid: Trimesh,
     points: np.ndarray,
     cells: np.ndarray,
     facets: np.ndarray,
@@ -574,9 +470,9 @@ def _on_surface(
     outer = np.unique(facets)
     moved, held = points[outer].copy(), np.isin(outer, np.concatenate([[-1], *flat]))
     for _ in range(4):
-        nearest = pieces.nearest(moved, side)
+        distance, nearest = _nearest_places(solid, moved)
         nearest[held, 0] = moved[held, 0]
-        moved = nearest
+        moved = np.where(distance[:, None] < side, nearest, moved)
     shift = np.zeros_like(points)
     shift[outer] = moved - points[outer]
     longest = np.linalg.norm(shift, axis=1, keepdims=True)
