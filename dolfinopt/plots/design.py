@@ -23,7 +23,7 @@ from dolfinopt.plots.style import (
     ORANGE,
     Box,
     colour_scale,
-    round_number,
+    round_marks,
     stacked_axes,
     styled,
 )
@@ -65,7 +65,7 @@ def design_figure(
     from dolfinopt.plots.solid import caption
 
     thickest = max((MILLI * float(v.wall.max()) for v in views if v.wall is not None), default=0.0)
-    marks = scale_marks(thickest)
+    marks = round_marks(0.0, thickest or 1.0, 5)
     figure, rows = _panels(views, title, thickest > 0.0)
     for axes, view in zip(rows, views, strict=True):
         wall = None if view.wall is None else MILLI * view.wall
@@ -108,7 +108,7 @@ def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     figure, rows = _panels(views, title, True)
     stresses = [MEGA * view.stress for view in views if view.stress is not None]
     largest = max(float(stress.max()) for stress in stresses)
-    marks = scale_marks(largest)
+    marks = round_marks(0.0, largest or 1.0, 5)
     for axes, view, stress in zip(rows, views, stresses, strict=True):
         _draw_arm(axes, view, stress, STRESS_COLOURS, marks[-1])
         worst, when = int(np.argmax(stress)), view.stress_instant
@@ -198,14 +198,6 @@ def box_of(corners: np.ndarray) -> Box:
 def bounds(view: ArmView) -> Box:
     """Return the box of an arm, m."""
     return box_of(view.corners)
-
-
-def scale_marks(largest: float) -> np.ndarray:
-    """Return round numbers from 0 to `largest` or a little beyond, four to six of them."""
-    if largest <= 0.0:
-        return np.array([0.0, 1.0])
-    step = round_number(largest / 5.0)
-    return step * np.arange(int(np.ceil(largest / step - 1e-9)) + 1)
 
 
 # -- one arm in its axes ---------------------------------------------------------------------

@@ -22,8 +22,8 @@ from dolfinopt.plots.style import (
     GREY,
     MILLI,
     Box,
+    round_marks,
     stacked_axes,
-    ticks,
 )
 
 if TYPE_CHECKING:
@@ -271,7 +271,9 @@ def _draw_ruler(axes: Axes, low: np.ndarray, high: np.ndarray, scale: float) -> 
 
     down = np.array([0.0, -8.0 / scale])
     room = float(np.linalg.norm(at_front(high[0]) - at_front(low[0]))) * scale
-    marks = ticks(MILLI * low[0], MILLI * high[0], max(2, int(room / 110.0)))
+    first, last = MILLI * low[0], MILLI * high[0]
+    marks = round_marks(first, last, max(2, int(room / 110.0)))
+    marks = marks[(marks >= first - 1e-9) & (marks <= last + 1e-9)]
     for mark in marks:
         at = at_front(mark / MILLI)
         axes.plot(*np.stack([at, at + down]).T, color="black", lw=0.8, clip_on=False)

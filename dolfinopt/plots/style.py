@@ -110,11 +110,11 @@ def round_number(value: float) -> float:
     return float(choices[np.argmin(np.abs(np.log(choices / value)))])
 
 
-def ticks(low: float, high: float, count: int = 10) -> np.ndarray:
-    """Return round numbers in [low, high], about `count` of them, evenly spaced."""
-    step = round_number((high - low) / count)
-    first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
-    return step * np.arange(int(first), int(last) + 1)  # of integers: there is no -0
+def round_marks(low: float, high: float, count: int) -> np.ndarray:
+    """Return at most `count` + 1 round numbers, evenly spaced, from `low` or below to `high`."""
+    from matplotlib.ticker import MaxNLocator
+
+    return np.asarray(MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(low, high))
 
 
 def mixed(colour: str, strength: float) -> str:

@@ -299,8 +299,8 @@ TENSOR = 'ixx="0.0261" ixy="-0.0001" ixz="-0.029" iyy="0.7576" iyz="0" izz="0.75
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('iyy="0.7576"', 'iyy="-0.7576"', "positive definite"),
-        ('iyy="0.7576"', 'iyy="1.7576"', "exceeds the sum of the others"),
+        ('iyy="0.7576"', 'iyy="-0.7576"', "none can be negative"),
+        ('iyy="0.7576"', 'iyy="1.7576"', "exceed the sum of the two others"),
         ('<mass value="7.879"/>', '<mass value="0"/>', "no mass"),
         ('<mass value="7.879"/>', '<mass value="7879"/>', "100 to 20000"),
         ('xyz="-0.4053 0 0.0604"', 'xyz="-405.3 0 60.4"', "outside its geometry"),

@@ -25,6 +25,7 @@ from dolfinopt.exchange.urdf.robot import (
     RobotLink,
     number,
 )
+from dolfinopt.scene.tables.arms import tensor_problem
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -414,7 +415,6 @@ def _folders_above(file: Path) -> list[Path]:
 DENSITIES = (100.0, 20000.0)  # kg/m3: a hollow cover, tungsten
 OUTSIDE = 0.1  # of the diagonal of the box around the geometry
 SLENDER = 0.03  # least radius of gyration over that diagonal; of a ball it is 0.18
-ROUNDING = 1e-6
 
 
 def implausible_inertias(robot: Robot) -> list[str]:
@@ -439,17 +439,13 @@ def _of_link(robot: Robot, link: RobotLink) -> Iterator[str]:
         elif tensor.any():
             yield "an inertia without mass"
         return
-    principal = np.linalg.eigvalsh(tensor)
-    told = f"principal moments {', '.join(f'{value:.4g}' for value in principal)} kg m2"
-    if principal[0] <= 0.0:
-        yield f"its inertia is not positive definite: {told}"
-    elif principal[2] > (1.0 + ROUNDING) * (principal[0] + principal[1]):
-        yield f"its inertia cannot be: of the {told} the largest exceeds the sum of the others"
+    if problem := tensor_problem(tuple(link.own.moments)):
+        yield problem
     if len(link.points):
-        yield from _of_size(link, principal)
+        yield from _of_size(link)
 
 
-def _of_size(link: RobotLink, principal: np.ndarray) -> Iterator[str]:
+def _of_size(link: RobotLink) -> Iterator[str]:
     """Compare mass, centre and inertia with the link's geometry."""
     mass, centre = link.own.mass, link.own.centre
     first, last = link.points.min(axis=0), link.points.max(axis=0)
@@ -457,7 +453,7 @@ def _of_size(link: RobotLink, principal: np.ndarray) -> Iterator[str]:
     away = float(np.linalg.norm(np.maximum(0.0, np.maximum(first - centre, centre - last))))
     if away > OUTSIDE * diagonal:
         yield f"its centre of mass is {away:.3g} m outside its geometry, {diagonal:.3g} m across"
-    gyration = float(np.sqrt(max(0.0, principal.sum() / 2.0 / mass)))
+    gyration = float(np.sqrt(max(0.0, np.trace(link.own.tensor) / 2.0 / mass)))
     if not SLENDER * diagonal <= gyration <= diagonal:
         yield (
             f"its inertia is too {'large' if gyration > diagonal else 'small'}: a radius of "

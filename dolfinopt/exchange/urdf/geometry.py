@@ -405,9 +405,10 @@ def _cells(
     notes: Sequence[str],
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
-    low, high = piece.bounds
+    low, high = piece.bounds.copy()
     side = min(side, float((high - low)[1:].min()) / FEWEST)
     if ends is not None:
+        low[0], high[0] = ends
         side = (ends[1] - ends[0]) / max(FEWEST, round((ends[1] - ends[0]) / side))
     blocks = np.maximum(1.0, np.rint((high - low) / side)).astype(int)
     start = 0.5 * (low + high) - 0.5 * blocks * side
