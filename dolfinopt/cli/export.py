@@ -283,7 +283,7 @@ def _robot_files(
     from dolfinopt.part.workshop_files import triangle_bytes
 
     before = read_robot(origin.file).links
-    links, index = [], {arm.name: k for k, arm in enumerate(scene.arms)}
+    links, arms = [], {arm.name: arm for arm in scene.arms}
     files, said = {}, []
     for name, link in origin.links.items():
         if name not in now or link not in before:
@@ -291,7 +291,10 @@ def _robot_files(
             continue
         frame, mesh = origin.frames[name], f"{name}.stl"
         body, surface = now[name]
-        inertia = link_inertia(scene, index[name], body).posed(frame)
+        arm, end = arms[name], np.array([arms[name].length, 0.0, 0.0])
+        own = Inertia(float(body.mass), *body.inertia_about_centre())
+        motor = Inertia(arm.joint_mass, end, arm.joint_inertia * np.eye(3))
+        inertia = (own + motor).posed(frame)
         facets = surface @ frame[:3, :3].T + frame[:3, 3]
         files[mesh] = triangle_bytes(facets, f"{name}, m")
         links.append(NewLink(link, inertia, mesh))
@@ -299,17 +302,3 @@ def _robot_files(
     files[origin.file.name] = robot_text(origin.file, links, folder)
     said.append(f"the robot with these links: {folder / origin.file.name}")
     return files, said
-
-
-def link_inertia(scene: Scene, index: int, body: ShapeIntegrals) -> Inertia:
-    """Return the inertia of a solid arm in its frame, with what sits at its outboard interface.
-
-    Args:
-        scene: of the run.
-        index: of the arm.
-        body: its integrals in space.
-    """
-    arm = scene.arms[index]
-    own = Inertia(float(body.mass), *body.inertia_about_centre())
-    motor = Inertia(arm.joint_mass, np.array([arm.length, 0.0, 0.0]), arm.joint_inertia * np.eye(3))
-    return own + motor

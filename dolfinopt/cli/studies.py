@@ -21,7 +21,7 @@ from dolfinopt.cli.shared import (
 )
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
-from dolfinopt.output.folders import read_record
+from dolfinopt.output.folders import listed_files, read_record, remove_stale
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, with_digests
 
@@ -65,13 +65,14 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
 
         # One folder for all studies of a scene, which share the optimised design.
         folder = out or Path("results") / f"{scene.stem}-study"
-        asked = on_root(world, _asked, loaded, designs) | question
+        known = [file_digest(path) if path.is_file() else str(path) for path in designs]
+        asked = {"scene": with_digests(loaded.to_dict()), "designs": known} | question
         if not overwrite:
             on_root(world, _check_question, folder, name, asked)
         done = carry_out(study(folder), Runner(folder, world, keep=keep))
 
         def conclude() -> None:
-            _remove_listed(folder, name)
+            remove_stale(folder, listed_files(folder / f"{name}.json"))
             written = write_study(done, folder)
             if plots:
                 from dolfinopt.study.figures import draw_study
@@ -90,16 +91,9 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
     return decorated
 
 
-def _asked(scene: Scene, designs: Sequence[Path]) -> dict[str, Any]:
-    """Return what tells one study from another: scene and designs, files by their content."""
-
-    known = [file_digest(path) if path.is_file() else str(path) for path in designs]
-    return {"scene": with_digests(scene.to_dict()), "designs": known}
-
-
 def _check_question(folder: Path, name: str, question: Mapping[str, Any]) -> None:
     """Raise InputError if the folder's files of this name answer another question."""
-    known = _record(folder, name).get("question")
+    known = read_record(folder / f"{name}.json").get("question")
     question = json.loads(json.dumps(question))
     if known is None or known == question:
         return
@@ -110,13 +104,6 @@ def _check_question(folder: Path, name: str, question: Mapping[str, Any]) -> Non
     )
 
 
-def _remove_listed(folder: Path, name: str) -> None:
-    """Remove what a study of this name has written before."""
-    for file in _record(folder, name).get("files", ()):
-        if isinstance(file, str) and Path(file).name == file:
-            (folder / file).unlink(missing_ok=True)
-
-
 def _write_question(
     folder: Path, name: str, question: Mapping[str, Any], files: Sequence[str]
 ) -> None:
@@ -124,11 +111,6 @@ def _write_question(
 
     text = json.dumps({"question": question, "files": sorted(files)}, indent=1)
     write_text(folder / f"{name}.json", text + "\n")
-
-
-def _record(folder: Path, name: str) -> dict[str, Any]:
-
-    return read_record(folder / f"{name}.json")
 
 
 @click.command()

@@ -78,11 +78,6 @@ def _stamp(scene: Scene) -> dict[str, np.ndarray]:
     }
 
 
-def reopen(folder: Path) -> None:
-    """Remove what a run that goes on will write anew, so that nothing old stands beside it."""
-    remove_stale(folder, keep=(NAME, "history.csv"))
-
-
 def save(
     folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm], memory: Memory
 ) -> None:

@@ -389,7 +389,10 @@ def _fit(
             f"expected (n,) and (n, {mesh.dim})"
         )
     for key, values in zip(keys[::2], (centroid, filtered), strict=True):
-        if values is not None and (values.shape[:1] != shape or not _are_numbers(values)):
+        if values is None:
+            continue
+        numbers = len(values) and values.dtype.kind in "fiu" and np.isfinite(values).all()
+        if values.shape[:1] != shape or not numbers:
             raise InputError(
                 f"{path}: {key}: expected {len(density)} finite numbers or rows of them, one a "
                 "cell; give a complete design"
@@ -397,10 +400,6 @@ def _fit(
     density = physical(f"{path}: {keys[1]}", density)
     place = _nearest(path, mesh, centroid[:, : mesh.dim].astype(float))
     return density[place], None if filtered is None else filtered.astype(float)[place]
-
-
-def _are_numbers(values: np.ndarray) -> bool:
-    return bool(len(values) and values.dtype.kind in "fiu" and np.isfinite(values).all())
 
 
 def _nearest(path: Path, mesh: ArmMesh, centroid: np.ndarray) -> np.ndarray:

@@ -229,15 +229,16 @@ def remove_stale_parts(run: Path, design: Path) -> str:
     folder = run / PARTS
     if not stale_parts(folder, design):
         return ""
-    names = [name for name in read_record(folder / PARTS_LIST).get("files", []) if _is_name(name)]
-    remove_stale(folder, [PARTS_LIST, *names])
+    remove_stale(folder, [PARTS_LIST, *listed_files(folder / PARTS_LIST)])
     with suppress(OSError):  # something of the user's is in it
         folder.rmdir()
     return f"{folder}: removed, its parts were of another design; new ones: dolfinopt part {run}"
 
 
-def _is_name(name: Any) -> bool:
-    return isinstance(name, str) and Path(name).name == name
+def listed_files(record: Path) -> list[str]:
+    """Return the names of the files that a record lists, all of its own folder."""
+    names = read_record(record).get("files", [])
+    return [name for name in names if isinstance(name, str) and Path(name).name == name]
 
 
 def read_record(path: Path) -> dict[str, Any]:

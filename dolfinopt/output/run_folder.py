@@ -36,6 +36,7 @@ from dolfinopt.output.folders import (
     RUN_FILES,
     check_sources,
     check_unused,
+    remove_stale,
     remove_stale_parts,
     working_alone,
     written_together,
@@ -206,7 +207,9 @@ def optimize(
                 on_root(world, checkpoint.begin, folder, scene)
             if resume:
                 memory = checkpoint.load(folder, scene, *built)
-                on_root(world, checkpoint.reopen, folder)
+                # What will be written anew goes, so that nothing old stands beside it.
+                kept = (checkpoint.NAME, HISTORY)
+                on_root(world, partial(remove_stale, keep=kept), folder)
             recorder = FolderRecorder(folder, scene, *built)
         return loop.run(
             scene,

@@ -158,7 +158,8 @@ def parts_figure(
     for axes, part, cells, mass in zip(rows, plates, corners, masses, strict=True):
         loops, shape = _loops(part), part.shape
         if own:
-            axes.add_patch(PathPatch(_compound(loops), fc=FACE, ec="none"))
+            closed = [Path(np.vstack([loop, loop[:1]]), closed=True) for loop in loops]
+            axes.add_patch(PathPatch(Path.make_compound_path(*closed), fc=FACE, ec="none"))
         else:
             fill_cells(axes, cells, part.domain.x_phys)
         for loop in loops:
@@ -294,13 +295,6 @@ def _caption(view: ArmView) -> str:
 def _loops(part: PlanePart) -> list[np.ndarray]:
     """Return the closed curves of a part as polygons (n, 2), mm; the outline first."""
     return [MILLI * loop for loop in part.shape.polygons(CHORD * part.domain.cell)]
-
-
-def _compound(loops: Sequence[np.ndarray]) -> Path:
-    """Return the face within an outline and without its holes."""
-    return Path.make_compound_path(
-        *(Path(np.vstack([loop, loop[:1]]), closed=True) for loop in loops)
-    )
 
 
 # -- polygons: areas and outlines -------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -139,8 +140,7 @@ def body_poses(
 
 def box_corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Return the corners (2^d, d) of a box."""
-    grid = np.meshgrid(*np.stack([low, high], axis=1), indexing="ij")
-    return np.stack([axis.ravel() for axis in grid], axis=1)
+    return np.array([*product(*zip(low, high, strict=True))])
 
 
 # -- instants ------------------------------------------------------------------------------------

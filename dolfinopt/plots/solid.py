@@ -22,7 +22,7 @@ from dolfinopt.plots.style import (
     GREY,
     MILLI,
     Box,
-    round_marks,
+    round_number,
     stacked_axes,
 )
 
@@ -104,7 +104,7 @@ class Studio:
     def solid(self, surface: Surface, **look: Any) -> None:
         """Draw a surface, if there is any; a look with `scalars` has values of its triangles."""
         if len(surface.triangles):
-            mesh = poly_data(surface)
+            mesh = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
             if "scalars" in look:
                 mesh.cell_data["values"] = look.pop("scalars")
                 look |= {"scalars": "values", "ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
@@ -148,11 +148,6 @@ class Studio:
         return axes.imshow(image, extent=extent, interpolation="antialiased", aspect="auto")
 
 
-def poly_data(surface: Surface) -> Any:
-    """Return a surface as PyVista's."""
-    return pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
-
-
 def material(view: ArmView, *, modes: bool = False) -> Surface:
     """Return the surface of what of a link is denser than one half, in the link's frame.
 
@@ -176,6 +171,12 @@ def draw_triad(axes: Axes, camera: Camera, at: np.ndarray, length: float) -> Non
         # An axis that points at the viewer is short: its name stands off all the same.
         x, y = at + 1.3 * max(1.0, 0.6 * length / float(np.linalg.norm(arrow))) * arrow
         axes.text(x, y, name, ha="center", va="center", fontsize=9)
+
+
+def draw_length(axes: Axes, at: np.ndarray, length: float, above: float) -> None:
+    """Draw a length from a place (2,) of the plane to the right, and its size `above` it; m."""
+    axes.plot([at[0], at[0] + length], [at[1], at[1]], color="black", lw=2.0, clip_on=False)
+    axes.text(at[0] + 0.5 * length, at[1] + above, f"{1e3 * length:.6g} mm", ha="center")
 
 
 def surfaces_figure(
@@ -235,7 +236,7 @@ def draw_link(
 
 
 def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: Any) -> None:
-    """Draw a surface, the edges of its box if they are wanted, and a ruler along these.
+    """Draw a surface, the edges of its box if they are wanted, a length and the directions.
 
     Args:
         axes: the link's, whose scale stays.
@@ -254,30 +255,7 @@ def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: 
     studio.show(axes, studio.close())
     axes.axis(limits)
     axes.set_axis_off()
-    _draw_ruler(axes, *box, scale)
-
-
-def _draw_ruler(axes: Axes, low: np.ndarray, high: np.ndarray, scale: float) -> None:
-    """Draw lengths along the lower front edge of a link's box, mm, and the directions.
-
-    Args:
-        axes: the link's.
-        low, high: (3,) corners of the box, m.
-        scale: px per m.
-    """
-
-    def at_front(x: float) -> np.ndarray:
-        return LINKS.plane(np.array([x, low[1], high[2]]))
-
-    down = np.array([0.0, -8.0 / scale])
-    room = float(np.linalg.norm(at_front(high[0]) - at_front(low[0]))) * scale
-    first, last = MILLI * low[0], MILLI * high[0]
-    marks = round_marks(first, last, max(2, int(room / 110.0)))
-    marks = marks[(marks >= first - 1e-9) & (marks <= last + 1e-9)]
-    for mark in marks:
-        at = at_front(mark / MILLI)
-        axes.plot(*np.stack([at, at + down]).T, color="black", lw=0.8, clip_on=False)
-        words = f"{mark:.6g} mm" if mark == marks[-1] else f"{mark:.6g}"
-        axes.text(at[0], at[1] + 1.6 * down[1], words, ha="center", va="top", fontsize=9)
-    corner = at_front(low[0]) + np.array([-42.0, 24.0]) / scale
-    draw_triad(axes, LINKS, corner, 26.0 / scale)
+    (low, high), px = box, 1.0 / scale
+    corner = LINKS.plane(np.array([low[0], low[1], high[2]]))  # at the front, below
+    draw_length(axes, corner - [0.0, 30.0 * px], round_number(0.2 * (high - low)[0]), 8.0 * px)
+    draw_triad(axes, LINKS, corner + np.array([-42.0, 24.0]) * px, 26.0 * px)

@@ -17,6 +17,7 @@ from dolfinopt.plots.solid import (
     Camera,
     Studio,
     camera_from,
+    draw_length,
     draw_triad,
     material,
 )
@@ -75,11 +76,10 @@ class SolidStage:
     def _draw_ruler(self, low: np.ndarray, span: np.ndarray) -> None:
         """Draw a length of the plane, its lowest corner and size (2,), m, and the directions."""
         length, (x, y) = round_number(0.12 * span[0]), low + 0.03 * span
-        self.axes.plot([x, x + length], [y, y], color="black", lw=2.0)
-        middle = x + 0.5 * length
-        self.axes.text(middle, y + 0.01 * span[1], f"{1e3 * length:.6g} mm", ha="center")
+        draw_length(self.axes, np.array([x, y]), length, 0.01 * span[1])
         arrow = 0.05 * float(span.min())
-        draw_triad(self.axes, self.camera, np.array([middle, y + 0.05 * span[1] + arrow]), arrow)
+        at = np.array([x + 0.5 * length, y + 0.05 * span[1] + arrow])
+        draw_triad(self.axes, self.camera, at, arrow)
 
     def flat(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 3), m, are in the axes."""

@@ -166,7 +166,8 @@ def measure_bodies(tree: Tree, inherited: set[Loc]) -> None:
             raise InputError(
                 f"{file}: no nodes; an arm needs an inboard node at the origin and an outboard node"
             )
+        length = math.hypot(*nodes[-1].origin.M0.ravel())
         if ("arms", i, "length") in inherited or "length" not in arm:
-            arm["length"] = math.hypot(*nodes[-1].origin.M0.ravel())
+            arm["length"] = length
         for key in ("height", "thickness"):
-            arm.setdefault(key, math.hypot(*nodes[-1].origin.M0.ravel()) / 20.0)
+            arm.setdefault(key, length / 20.0)

@@ -209,7 +209,8 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
             if key not in row:
                 continue
             value = row.pop(key)
-            unset = value is None or _plain(value) == word.default
+            plain = list(value) if isinstance(value, tuple) else value
+            unset = value is None or plain == word.default
             if word.new and value is not None:
                 if not anew and not unset:
                     _refuse_both(row, word, source)
@@ -228,10 +229,6 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
             row["kind"] = OLD_KINDS[kind]
             told.append(f'objective.kind = "{kind}" is read as "{OLD_KINDS[kind]}"')
     return list(dict.fromkeys(told))
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _refuse_both(row: Row, word: OldWord, source: str) -> None:

@@ -425,7 +425,11 @@ def verdict(scene: Scene, frame: pd.DataFrame) -> str:
     is_limited, limits = bool(limited(design["outcome"])), _limits(design["outcome"])
     able = [row for row in others if not row["failure"]]
     if is_limited:
-        able = [row for row in able if row["made"] == LIGHTEST and _holds(row["outcome"])]
+        able = [
+            row
+            for row in able
+            if row["made"] == LIGHTEST and all(x["met"] for x in _limits(row["outcome"]).values())
+        ]
     over = {name: _excess(limit) for name, limit in limits.items() if not limit["met"]}
     kinds = {row["section"] for row in others if row["made"] == SAME}
     text = filled(
@@ -448,11 +452,6 @@ def verdict(scene: Scene, frame: pd.DataFrame) -> str:
         missing=[kind for kind in KINDS[scene.dimension] if kind not in kinds],
     )
     return " ".join(text.split())
-
-
-def _holds(outcome: Outcome) -> bool:
-    """Return whether every limit but that of the volume holds."""
-    return not outcome.failure and all(limit["met"] for limit in _limits(outcome).values())
 
 
 def _limit_cells(outcome: Outcome) -> dict[str, str]:

@@ -30,7 +30,7 @@ from dolfinopt.disk import RUN
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.folders import RUN_FILES
 from dolfinopt.part.folder import toml_text
-from dolfinopt.progress import show_slow_work
+from dolfinopt.progress import log, show_slow_work
 
 TINY = overrides("arms.cells=[12,3]", "simulation.sample=0.01", "simulation.tolerance=1e-2")
 SMALL = overrides("arms.cells=[40,4]", "simulation.sample=0.005")
@@ -433,6 +433,8 @@ def test_arm_of_a_file_without_geometric_stiffness(tmp_path, capsys, stiffening)
 @pytest.mark.serial
 def test_lines_while_an_optimisation_runs(capsys, monkeypatch):
     monkeypatch.setattr("dolfinopt.progress.SILENT", 0.0)
+    for name, value in (("handlers", []), ("propagate", True), ("level", 0)):  # as before, after it
+        monkeypatch.setattr(log, name, value)
     show_slow_work()
     say = progress(MPI.COMM_SELF, "optimize")
     say(in_words(HistoryRow(7, 2.5, 0.0075, 0.3, 0.5, 0.2, 1.0), 400))

@@ -161,9 +161,7 @@ def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]
     along, over, through = map(int, np.ceil((high - low + 2.0 * margin) / step))
     grid = _Grid(low - margin, step, (along, over, through))
     shell = np.zeros(grid.shape, dtype=bool)
-    for piece in closed:
-        shell |= grid.filled_by(piece)
-    for piece in left:
+    for piece in (*closed, *left):
         shell |= grid.passed_by(piece)
     shell = ndimage.binary_dilation(shell, iterations=radius)
     shell = ndimage.binary_fill_holes(shell)

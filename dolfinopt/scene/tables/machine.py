@@ -230,10 +230,8 @@ class Closures(Table):
             if getattr(self, key) is None:
                 reason = f"expected an array of three numbers with a {self.kind}"
                 raise Refusal(reason, key, "kind")
-        if self.kind == "universal":
-            self._check_cross()
-
-    def _check_cross(self) -> None:
+        if self.kind != "universal":
+            return
         assert self.axis is not None and self.cross_axis is not None
         along = sum(a * b for a, b in zip(self.axis, self.cross_axis, strict=False))
         if abs(along) > 1e-6 * math.hypot(*self.axis) * math.hypot(*self.cross_axis):
