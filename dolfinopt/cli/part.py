@@ -253,18 +253,13 @@ class PartsJob:
 
 def tell(check: Check) -> None:
     """Print the table of a check and what it says."""
-    from pandas import DataFrame
-
     against = "part/density" if check.crisp is None else "part/crisp"
     figures = check.table()
     forms = [name for name in figures.columns if name != "unit" and "/" not in name]
-    rows = [
-        [*(f"{row[form]:.4g}" for form in forms), row["unit"], f"{100.0 * row[against]:+.2f} %"]
-        for _, row in figures.iterrows()
-    ]
-    names = [str(name).replace("_", " ") for name in figures.index]
-    cells = [["-" if "nan" in cell else cell for cell in row] for row in rows]
-    click.echo(DataFrame(cells, names, [*forms, "unit", against]).to_string())
+    shown = figures[[*forms, "unit", against]].rename_axis(None)
+    shown = shown.rename(lambda name: name.replace("_", " "))
+    words = {against: lambda share: "-" if share != share else f"{100.0 * share:+.2f} %"}
+    click.echo(shown.to_string(float_format="{:.4g}".format, formatters=words, na_rep="-"))
     for line in (check.loss, *check.notes):
         click.echo(line)
     for limit in check.part.limits:

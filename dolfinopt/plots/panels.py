@@ -92,9 +92,6 @@ def draw_panel(axes: Axes, panel: Panel, styles: Looks | None = None) -> None:
         log2_scale(axes)
     elif len(x) and (x % 1 == 0).all() and not panel.log:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
-    if len(x) and not (panel.log or panel.x_log2):
-        margin = 0.0 if len(x) > FEW_POINTS else 0.05 * np.ptp(x) or 0.5
-        axes.set_xlim(x.min() - margin, x.max() + margin)
     axes.set_title(panel.title)
     axes.set_title(panel.note, loc="right")
     axes.set_xlabel(panel.x_label)

@@ -99,12 +99,8 @@ def _added(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Block]:
 
 def _comment(text: str) -> str:
     """Return the comment behind the value of a key."""
-    line = text.splitlines()[-1]
-    for place in re.finditer(r"\s*#", line):
-        head = line[: place.start()]
-        if head.count('"') % 2 == 0 and head.count("'") % 2 == 0:
-            return line[place.start() :]
-    return ""
+    hashes = (place.start() for place in re.finditer(r"\s*#", text))
+    return next((text[at:].rstrip() for at in hashes if _is_complete(text[:at])), "")
 
 
 def _blocks(text: str) -> list[Block]:

@@ -85,10 +85,8 @@ def parse_vary(text: str) -> Vary:
     if int(parts[2]) < 2 or float(parts[0]) == float(parts[1]):
         raise InputError(f"--vary {text}: expected at least two values between two ends")
     steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
-    # Whole numbers stay whole: a key may be an integer.
-    are_whole = all(re.fullmatch(r"[+-]?\d+", part) for part in parts[:2])
-    are_whole = are_whole and bool((steps % 1 == 0).all())
-    return Vary(key, tuple(str(int(v)) if are_whole else repr(float(v)) for v in steps), text)
+    # Whole numbers are written as such: a key may be an integer.
+    return Vary(key, tuple(repr(step).removesuffix(".0") for step in steps.tolist()), text)
 
 
 def _is_number(text: str) -> bool:

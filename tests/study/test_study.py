@@ -50,8 +50,8 @@ def is_drawn(path):
     ("text", "values"),
     [
         ("payload.mass=4:8:3", ("4", "6", "8")),
-        ("payload.mass=4:5:3", ("4.0", "4.5", "5.0")),
-        ("payload.mass=4.0:8:3", ("4.0", "6.0", "8.0")),
+        ("payload.mass=4:5:3", ("4", "4.5", "5")),
+        ("payload.mass=4.0:8:3", ("4", "6", "8")),
         ("payload.mass = 8:4:2", ("8", "4")),
         ("payload.mass=1e-1,2", ("1e-1", "2")),
         ("payload.mass=2,2", ("2",)),

@@ -32,7 +32,6 @@ MANY = 300  # pieces of a surface from which on it is filled as it is, not piece
 TINY = 0.02  # of the link's size: smaller pieces (screws, labels) are left out
 SHELL = 128  # voxels along a link on which open pieces are filled
 GAP = 0.02  # of the link's size: half of the widest gap that a closing bridges
-SAMPLES = 12  # points on the surface of an open piece for each voxel that it passes
 SHORTEST = 0.4  # of the distance between the joints that the geometry must bridge to be cut there
 MARGIN = 0.03  # of that distance, which is cut off where the geometry ends before a joint
 KEPT_ALL = 0.995  # share of the largest piece from which on nothing is said of the others
@@ -130,11 +129,8 @@ class _Grid:
 
     def passed_by(self, surface: Trimesh) -> np.ndarray:
         """Return True for the voxels that a surface passes."""
-        from trimesh.sample import sample_surface
-
-        count = math.ceil(SAMPLES * surface.area / self.step**2)
-        places = np.vstack([sample_surface(surface, count, seed=0)[0], surface.vertices])
-        inside = np.floor((places - self.low) / self.step).astype(int)
+        fine: Any = surface.subdivide_to_size(0.5 * self.step, max_iter=20)
+        inside = np.floor((fine.vertices - self.low) / self.step).astype(int)
         inside = inside[((inside >= 0) & (inside < self.shape)).all(axis=1)]
         result = np.zeros(self.shape, dtype=bool)
         result[tuple(inside.T)] = True

@@ -320,21 +320,15 @@ def read_trajectory(
 
 def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...]:
     """Return the names of a table's columns but t, all joints with a coordinate of their own."""
-    joints = {joint.name: joint for joint in robot.joints}
+    joints = [joint.name for joint in robot.joints]
     own = [joint.name for joint in robot.movable if joint.mimic is None]
     allowed = f"expected t and any of {', '.join(own)}"
-    result = tuple(name for name in names if name != "t")
     if "t" not in names:
         raise InputError(f"{file}: no column t, the instants in s; {allowed}")
-    for name in result:
-        if name in own:
-            continue
-        what = "this joint is fixed"
-        if (joint := joints.get(name)) is None:
-            what = "the robot has no such joint"
-        elif joint.mimic is not None:
-            what = f"this joint follows {joint.mimic.joint!r}"
-        raise InputError(f"{file}: column {name!r}: {what}; {allowed}")
+    result = tuple(name for name in names if name != "t")
+    if wrong := [name for name in result if name not in own]:
+        what = "this joint is fixed, or follows another" if wrong[0] in joints else "no such joint"
+        raise InputError(f"{file}: column {wrong[0]!r}: {what}; {allowed}")
     return result
 
 
