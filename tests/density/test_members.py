@@ -223,7 +223,7 @@ REFUSED = [  # keys changed; key, value and what is expected
     (["design.minimum_member=-1.0"], ("minimum_member = -1", ">= 0")),
     ([ROBUSTLY, "design.minimum_member=0.014"], ("minimum_member = 0.014", "3 cells", "0.015 [m]")),
     ([ROBUSTLY, "design.minimum_gap=0.014"], ("minimum_gap = 0.014", "3 cells", "0.015 [m]")),
-    ([ROBUSTLY, "design.minimum_member=0.021"], ("0.021", "a third of the height", "0.02 [m]")),
+    ([ROBUSTLY, "design.minimum_member=0.021"], ("0.021", "two members", "0.06 [m]")),
     ([ROBUSTLY, "design.minimum_member=0.02", "design.filter_radius=0.01"],
      ("filter_radius = 0.01", "0.0075", "minimum_member = 0.02", "0.049976")),
     ([*TALL, "design.minimum_member=0.015", "design.minimum_gap=0.08"],
@@ -233,7 +233,7 @@ REFUSED = [  # keys changed; key, value and what is expected
     ([ROBUSTLY, "design.minimum_member=0.015", "design.minimum_gap=0.035"],
      ("0.015 [m]", "0.035 [m]", "height of arm")),
     ([ROBUSTLY, "design.minimum_member=0.018", "arms.arm2.design=arm1", "arms.arm2.height=0.05"],
-     ("0.018", "a third of the height", "arm1", "0.01667")),
+     ("0.018", "two members", "arm1", "0.05 [m]")),
 ]  # fmt: skip
 
 

@@ -664,7 +664,7 @@ def declare_law(law_declaration: LawDeclaration, words: Mapping[str, str]) -> No
     """Let scenes that are read from now on name a kind of material, and keys of its own.
 
     Args:
-        one: the kind.
+        law_declaration: of the kind.
         words: what its keys mean, with the unit; of those that [material] has they say nothing.
     """
     from dolfinopt.scene.schema import Scene

@@ -189,17 +189,12 @@ class Design(Table):
                     raise Refusal(reason, f"design.{key}", f"arms.{i}.height")
             member, gap = self.least_widths
             if 2.0 * member + gap > height * (1.0 + 1e-9):
-                reason = (
-                    f"expected at most a third of the height of {smallest}, {height / 3.0:.4g} "
-                    "[m]: two members and a gap"
+                raise Refusal(
+                    f"expected two members of {member:.4g} [m] and a gap of {gap:.4g} [m] within "
+                    f"the height of {smallest}, {height:.4g} [m]",
+                    *(f".{key}" for key in self.stated_widths),
+                    f"arms.{i}.height",
                 )
-                if member != gap:
-                    reason = (
-                        f"expected two members of {member} [m] and a gap of {gap} [m] within the "
-                        f"height of {smallest}, {height:.4g} [m]"
-                    )
-                keys = [f".{key}" for key in self.stated_widths]
-                raise Refusal(reason, *keys, f"arms.{i}.height")
 
 
 # -- `[[arms.regions]]` --------------------------------------------------------------------------

@@ -308,16 +308,12 @@ class Reduction(Table):
         self._check_frequencies()
         if not self.count or self.count >= self.fewest:
             return
+        what = "interface loads at each of reduction.frequencies"
         if self.method == "craig-bampton":
-            raise Refusal(
-                'expected an integer >= 3 with reduction.method = "craig-bampton" '
-                "(its constraint modes)",
-                "coordinates",
-                "method",
-            )
+            what = "constraint modes"
         raise Refusal(
-            f'expected an integer >= {self.fewest} with reduction.method = "krylov" '
-            "(the interface loads at each of reduction.frequencies)",
+            f'expected an integer >= {self.fewest} with reduction.method = "{self.method}" '
+            f"(its {what})",
             "coordinates",
             "method",
             "frequencies",
