@@ -72,7 +72,7 @@ class LinkCells:
     inboard: np.ndarray
     outboard: np.ndarray
     side: float
-    done: tuple[str, ...]
+    done: tuple[str, ...] = ()
 
     @property
     def volume(self) -> float:
@@ -205,9 +205,9 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
     count = CELLS
     while count <= MOST:
         side = float(np.cbrt(piece.volume / count))
-        cells = _cells(solid, piece, ends, side, body.length, notes)
+        cells = _cells(solid, piece, ends, side, body.length)
         if cells is not None:
-            return replace(cells, done=(*cells.done, *_thin_walls(solid, cells)))
+            return replace(cells, done=(*notes, *_thin_walls(solid, cells)))
         count = round(1.5 * count)
     raise NoSolid(f"its walls are too thin for {MOST} cells")
 
@@ -396,7 +396,6 @@ def _cells(
     ends: np.ndarray | None,
     side: float,
     length: float,
-    notes: Sequence[str],
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
     low, high = piece.bounds.copy()
@@ -432,7 +431,7 @@ def _cells(
         patches = _nearest(points, facets, length)
     held = [np.unique(patch) for patch in patches]
     points = _on_surface(solid, points, cells, facets, side, held if ends is not None else [])
-    return LinkCells(points, cells, patches[0], patches[1], side, tuple(notes))
+    return LinkCells(points, cells, patches[0], patches[1], side)
 
 
 def _nearest(points: np.ndarray, facets: np.ndarray, length: float) -> list[np.ndarray]:

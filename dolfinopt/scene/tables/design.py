@@ -205,6 +205,12 @@ RegionKind = Literal["solid", "void"]
 BORDER = 1e-6
 
 
+def _lies_within(x: Any, low: float, high: float) -> Any:
+    """Return whether numbers lie from `low` to `high`, with a `BORDER` around it."""
+    border = BORDER * (high - low)
+    return (x >= low - border) & (x <= high + border)
+
+
 class Region(Table):
     """A part of an arm that stays solid or void whatever the design."""
 
@@ -247,21 +253,13 @@ class Region(Table):
             x, y: numbers or arrays, m.
             z: alike; what it is matters only with `depth`.
         """
-        inside = self._covers_outline(x, y)
-        if self.depth is None:
-            return inside
-        z0, z1 = self.depth
-        dz = BORDER * (z1 - z0)
-        return inside & (z >= z0 - dz) & (z <= z1 + dz)
-
-    def _covers_outline(self, x: Any, y: Any) -> Any:
-        if self.box is not None:
-            x0, y0, x1, y1 = self.box
-            dx, dy = BORDER * (x1 - x0), BORDER * (y1 - y0)
-            return (x >= x0 - dx) & (x <= x1 + dx) & (y >= y0 - dy) & (y <= y1 + dy)
-        assert self.circle is not None
-        middle_x, middle_y, radius = self.circle
-        return (x - middle_x) ** 2 + (y - middle_y) ** 2 <= (radius * (1.0 + BORDER)) ** 2
+        x0, y0, x1, y1 = self.bounds
+        inside = _lies_within(x, x0, x1) & _lies_within(y, y0, y1)
+        if self.circle is not None:
+            middle_x, middle_y, radius = self.circle
+            far = (x - middle_x) ** 2 + (y - middle_y) ** 2
+            inside = far <= (radius * (1.0 + BORDER)) ** 2
+        return inside if self.depth is None else inside & _lies_within(z, *self.depth)
 
 
 # -- `[interpolation]` ---------------------------------------------------------------------------
