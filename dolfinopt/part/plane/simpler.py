@@ -35,7 +35,7 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
 
 def _without_holes(sides: Sides, least: float) -> Iterator[Sides]:
     """Yield the outline without one of its free holes, and its image, that are smaller, m2."""
-    for loop in sides.loops[1:]:
+    for loop in sorted(sides.loops[1:], key=lambda loop: abs(loop.area)):
         keys = {key for side in loop.sides for key in (side.key, side.twin)}
         if all(side.free for side in loop.sides) and abs(loop.area) < least:
             kept = [item for item in sides.loops if keys.isdisjoint(s.key for s in item.sides)]
