@@ -114,14 +114,14 @@ class Search:
     def run(self, iterations: int, tell: Tell) -> str:
         """Take steps, so many in all at most; return why the search ended."""
         while True:
-            if self.since >= FOLLOWED or self.steps >= iterations:
-                if self.steps < iterations:
-                    self._simplified()
-                self._mesh_anew()
-                if self._settled():
-                    return "settled"
             if self.steps >= iterations:
                 return f"{iterations} iterations"
+            if self.since >= FOLLOWED:
+                settled = self._settled()
+                self._simplified()
+                if settled:
+                    return "settled"
+                self._mesh_anew()
             if self._step():
                 tell(self._line())
             elif self.since > 0:
@@ -143,8 +143,6 @@ class Search:
 
     def _mesh_anew(self) -> None:
         """Go on with new meshes."""
-        value = self.state.values[0]
-        self.falls.append((self.steps, value + abs(value) * self.state.excess))
         try:
             self.problem, self.state = self.problem.calibrated(self.state)
         except (ConvergenceError, InputError):  # sides that all but touch
@@ -169,8 +167,11 @@ class Search:
                 simpler = simpler[: len(simpler) // 2]
 
     def _settled(self) -> bool:
-        now = self.falls[-1][1]
+        """Note how far the search is; return whether it brings little."""
+        value = self.state.values[0]
+        now = value + abs(value) * self.state.excess
         before = [merit for step, merit in self.falls if step <= self.steps - 2 * FOLLOWED]
+        self.falls.append((self.steps, now))
         return bool(before) and before[-1] - now < SETTLED * abs(now)
 
     def _line(self) -> str:
@@ -219,8 +220,8 @@ class Search:
         lower = np.maximum(np.maximum(OVER * dual, 0.7 * self.prices), LEAST_PRICE)
         high = dual < 0.5 * self.prices
         self.prices[high] = np.minimum(lower, self.prices)[high]
-        before, after = state.values[1:], step.state.values[1:]
-        self.prices[after > np.maximum(5.0 * EXCESS, FALLS * before)] *= 2.0  # it costs too little
+        low = step.state.values[1:] > np.maximum(5.0 * EXCESS, FALLS * state.values[1:])
+        self.prices[low] *= 2.0
         self.before = None if step.anew else (step, linear)
         self.since, self.steps, self.state = self.since + 1, self.steps + 1, step.state
 

@@ -79,8 +79,8 @@ class FreeSides:
         """Return it without what its limits hold at its least, every one without a thing more."""
         result = [self]
         while True:
-            last, edges = result[-1], self.part.domain.outer_edges
-            for sides in simplifications(last.sides, self.limits, edges):
+            last = result[-1]
+            for sides in simplifications(last.sides, self.limits, self.part.domain.outer_edges):
                 near = replace(last, sides=sides).nearest()
                 if near is not None and near[0].count < last.count:
                     result.append(near[0])
