@@ -82,7 +82,7 @@ class FreeSides:
             last = result[-1]
             for sides in simplifications(last.sides, self.limits, self.part.domain.outer_edges):
                 near = replace(last, sides=sides).nearest()
-                if near is not None and near[0].count < last.count:
+                if near is not None and 0 < near[0].count < last.count:
                     result.append(near[0])
                     break
             else:
