@@ -177,6 +177,9 @@ def test_ties_hold_mirror_images():
     sides = Sides((Loop(tuple(free), loop.corners),))
     # Offset and turn of both, the middle's offset, two pairs of radii.
     assert sides.count == 2 + 1 + 2
+    # What a turn moves at the far ends of the fillets beside it, no further than x.
+    for key, at in sides.numbers[1].items():
+        assert np.abs(sides.ties[at + 1]).max() * (0.5 * sides.lengths[key] + 0.003) <= 1.0 + 1e-9
 
 
 def test_sides_of_a_frame_are_straight_flanges_and_struts(design):

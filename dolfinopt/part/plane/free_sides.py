@@ -75,17 +75,18 @@ class FreeSides:
         """Return what must not be positive (m,), m, and its derivatives (m, count)."""
         return self.limits.rows(self.sides)
 
-    def simplified(self) -> tuple[FreeSides, int]:
-        """Return it without what its limits hold at its least, and how many such things went."""
-        simpler, number = self, 0
+    def simpler(self) -> list[FreeSides]:
+        """Return it without what its limits hold at its least, every one without a thing more."""
+        result = [self]
         while True:
-            for sides in simplifications(simpler.sides, self.limits, self.part.domain.outer_edges):
-                result = replace(simpler, sides=sides).nearest()
-                if result is not None and result[0].count < simpler.count:
-                    simpler, number = result[0], number + 1
+            last = result[-1]
+            for sides in simplifications(last.sides, self.limits, self.part.domain.outer_edges):
+                near = replace(last, sides=sides).nearest()
+                if near is not None and 0 < near[0].count < last.count:
+                    result.append(near[0])
                     break
             else:
-                return simpler, number
+                return result[1:]
 
     def moved(self, x: np.ndarray) -> FreeSides:
         """Return it after a step x.

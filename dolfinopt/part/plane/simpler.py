@@ -1,7 +1,7 @@
 """Other layouts of a part: without sides that vanish and holes that close.
 
-A search moves sides until limits of the geometry hold them: a side at its least length, a hole at
-its smallest. Without them the outline is simpler, and free to move on.
+A search moves sides until limits of the geometry hold them: a side at its least length or in line
+with the next one, a hole at its smallest. Without them the outline is simpler, and free to move on.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from dolfinopt.part.plane.curves import within_half_turn
 from dolfinopt.part.plane.fit import Drawn, cleaned, looped, without
 from dolfinopt.part.plane.limits import SHORT, Limits
 from dolfinopt.part.plane.sides import Sides
@@ -23,19 +24,27 @@ def simplifications(sides: Sides, limits: Limits, outer: int) -> Iterator[Sides]
     done: set[int] = set()
     for i in range(len(sides.loops)):
         drawn = _drawn(sides, i)
-        nearly = 2.0 * SHORT * limits.cell  # of its least length
-        for item in drawn:
+        for before, item, after in zip(drawn[-1:] + drawn, drawn, drawn[1:] + drawn):
             if not item.side.free or item.side.key in done or len(drawn) < 4:
                 continue
             done |= item.names
-            if np.linalg.norm(item.end - item.start) < nearly:
+            # By their length alone, and half as much, two bored arms keep 250 and 237 pieces for
+            # 226 and 217, and a compliance 0.1 % less.
+            if _effect(item, before, after) < 4.0 * SHORT * limits.cell:
                 yield from _without(sides, item.names, limits, outer)
     yield from _without_holes(sides, SMALL * max(limits.cell, limits.tool) ** 2)
 
 
+def _effect(item: Drawn, *beside: Drawn) -> float:
+    """Return by how much the outline moves, about, where a side goes, m."""
+    turns = np.array([item.side.angle - other.side.angle for other in beside if other.side.free])
+    size = np.linalg.norm(item.end - item.start)
+    return float(size * np.abs(within_half_turn(turns)).min(initial=1.0))
+
+
 def _without_holes(sides: Sides, least: float) -> Iterator[Sides]:
     """Yield the outline without one of its free holes, and its image, that are smaller, m2."""
-    for loop in sides.loops[1:]:
+    for loop in sorted(sides.loops[1:], key=lambda loop: abs(loop.area)):
         keys = {key for side in loop.sides for key in (side.key, side.twin)}
         if all(side.free for side in loop.sides) and abs(loop.area) < least:
             kept = [item for item in sides.loops if keys.isdisjoint(s.key for s in item.sides)]
