@@ -75,10 +75,13 @@ def part(
     scene: Scene = on_root(world, scene_of, folder, overrides)
     target = out or folder / "part"
     scene.check_designed()
+    searched = bool(scene.part.optimize) if optimize is None else optimize
+    if iterations and not searched:
+        raise InputError("--iterations: limits --optimize, which is not asked for")
     given = {
         "tool_radius": tool_radius,
         "tolerance": tolerance,
-        "optimize": (iterations or True) if optimize else optimize,
+        "optimize": iterations or optimize,
         "starts": starts,
     }
     asked = scene.part.unchecked_copy({k: v for k, v in given.items() if v is not None})

@@ -182,6 +182,7 @@ def test_browser_draws_the_svg(part, tmp_path):
         (["--tolerance", "nan"], "--tolerance = nan m: expected a length"),
         (["--tolerance", "0.5"], "expected at most a cell of arm 'arm1'"),
         (["--tool-radius", "-1"], "--tool-radius = -1 m: expected a length of at least 0 m"),
+        (["--iterations", "2"], "--iterations: limits --optimize, which is not asked for"),
         (["--tool-radius", "0.04"], "the tool is as wide as arm 'arm1', which is 0.06 m high"),
     ],
 )

@@ -179,8 +179,17 @@ def test_killed_search_goes_on(made):
 
 
 def test_command_goes_on(tmp_path, monkeypatch):
-    folder = folder_with(tmp_path / "run", frame, *SMALL, "part.optimize=true", "part.iterations=3")
-    words = ("part", folder, "--no-plots", "--no-check", "--out", tmp_path / "out")
+    folder = folder_with(tmp_path / "run", frame, *SMALL, "part.optimize=true")
+    words = (
+        "part",
+        folder,
+        "--iterations",
+        3,
+        "--no-plots",
+        "--no-check",
+        "--out",
+        tmp_path / "out",
+    )
     with refused("--resume", "shapes.npz"):
         run(*words, "--resume")
 
