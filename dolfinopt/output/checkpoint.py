@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copyreg
+import hashlib
 import json
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
 NAME = CHECKPOINT
+SEAL = "digest"  # of all other arrays
 # All that a pickled memory may name: a file from elsewhere can run nothing.
 CLASSES = {
     "dolfinopt.optimization.state": ("Memory", "Best", "Progress", "HistoryRow"),
@@ -55,7 +57,7 @@ def _scene_text(scene: Scene) -> str:
 def begin(folder: Path, scene: Scene) -> None:
     """Write the checkpoint of a run that has done nothing yet, and nothing else (root only)."""
     remove_stale(folder)
-    write_arrays(folder / NAME, _stamp(scene))
+    _sealed(folder, _stamp(scene))
 
 
 @contextmanager
@@ -85,7 +87,22 @@ def save(
     arrays = _of_arms(partition, arms, memory, len(scene.arms) + 1)
     with together(partition.world):
         if partition.world.rank == 0:
-            write_arrays(folder / NAME, _stamp(scene) | arrays | _of_run(memory))
+            _sealed(folder, {**_stamp(scene), **arrays, **_of_run(memory)})
+
+
+def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write the checkpoint with a digest, so that a changed one is known."""
+    write_arrays(folder / NAME, {**arrays, SEAL: np.array(_digest(arrays))})
+
+
+def _digest(arrays: Mapping[str, np.ndarray]) -> str:
+    """Return what stands for names, types, shapes and values of arrays."""
+    result = hashlib.blake2b(digest_size=16)
+    for key in sorted(arrays):
+        array = arrays[key]
+        result.update(f"{key} {array.dtype.str} {array.shape}".encode())
+        result.update(array.tobytes())
+    return result.hexdigest()
 
 
 def check(folder: Path, scene: Scene) -> None:
@@ -111,7 +128,7 @@ def load(
 
 
 def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
-    """Read the checkpoint, of which ZIP tells damage, and verify that it is of this scene."""
+    """Read and verify the checkpoint."""
     path = folder / NAME
     if not path.is_file():
         raise InputError(
@@ -121,6 +138,8 @@ def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {key: data[key] for key in data.files}
+        if str(arrays.pop(SEAL)) != _digest(arrays):
+            raise ValueError("it was changed")
         theirs = json.loads(str(arrays["scene"]))
     except Exception as error:  # whatever a foreign or damaged file may raise
         raise InputError(

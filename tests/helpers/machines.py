@@ -351,6 +351,7 @@ def fork() -> dict:
         "damping": {"stiffness_proportional": 1e-4},
         "reduction": {"coordinates": 12},
         "simulation": {"sample": 0.005, "tolerance": 1e-3, "stiffening": True},
+        "design": {"volume_fraction": 0.6},  # solid cells are half of it
         "objective": {"load_cases": 6},
     }  # fmt: skip
 

@@ -100,8 +100,8 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
         drawn = _drawn(outline, limits, 0.5**halvings * tolerance)
         with suppress(BrokenError):
             result = limits.nearest(drawn, area=area) or limits.nearest(drawn)
-            if result is not None:
-                return result[0]
+            if result is not None:  # from where limits are kept the area is in reach more often
+                return (limits.nearest(result[0], area=area) or result)[0]
     raise InputError(
         f"arm {outline.domain.name!r}: no straight sides and fillets within {tolerance:g} m of "
         "the outline; choose another --tolerance or a smaller --tool-radius"
