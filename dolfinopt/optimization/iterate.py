@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,13 +21,7 @@ from dolfinopt.optimization.measured import (
     STEP_ATTEMPTS,
 )
 from dolfinopt.optimization.mma import MMAState, initial_state, mma_step
-from dolfinopt.optimization.problem import (
-    EvaluatedDesign,
-    Problem,
-    eroded_share,
-    limits_at,
-    problem_of,
-)
+from dolfinopt.optimization.problem import EvaluatedDesign, Problem, limits_at, problem_of
 from dolfinopt.optimization.residual import Residual, kkt_residual
 from dolfinopt.optimization.state import Best, HistoryRow, Memory, Progress
 from dolfinopt.parallel import on_root, sum_over_arms
@@ -135,10 +128,9 @@ class Iterate:
         """Go on to MMA's next design (collective).
 
         A step whose motion cannot be simulated, or that makes the objective or a limit twice as
-        bad, or by which the eroded design comes to twice a limit, is made without a steeper
-        projection, then a quarter as long; after four attempts x stays and `stuck` says why. The
-        next steps are half as long where the merit rose, else longer again, but not as long as the
-        projection becomes steeper.
+        bad, is made without a steeper projection, then a quarter as long; after four attempts x
+        stays and `stuck` says why. The next steps are half as long where the merit rose, else
+        longer again, but not as long as the projection becomes steeper.
         """
         size = abs(self.problem.f0) or 1.0
         merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
@@ -167,12 +159,7 @@ class Iterate:
 
     def _reach_after(self, reach: float, rises: bool, rose: bool) -> float:
         """Return the factor on the move limit of the next step from that of the last one."""
-        growth = 1.0 if rises else REACH_GROWTH
-        least = LEAST_REACH
-        if rises:
-            least = self.projection.least_reach
-        elif self.scene.design.projection and self.projection.complete:
-            least = 0.0  # a sharp projection leaps however short the step: so it settles
+        growth, least = (1.0, self.projection.least_reach) if rises else (REACH_GROWTH, LEAST_REACH)
         return min(1.0, max(least, reach * (SHORTER_REACH if rose else growth)))
 
     def _tried(self, new: np.ndarray) -> list[EvaluatedDesign] | None:
@@ -190,8 +177,7 @@ class Iterate:
             return None
         held = limits_at(self.scene, self.designs)
         tried = problem_of(self.scene, designs, held)
-        shares = [eroded_share(self.scene, known) for known in (self.designs, designs)]
-        if leaps(self.problem.values, tried.values, shares):
+        if leaps(self.problem.values, tried.values):
             self.evaluator.undo()
             return None
         return designs
@@ -287,18 +273,15 @@ class Iterate:
         self.projection.beta = memory.beta
 
 
-def leaps(before: np.ndarray, after: np.ndarray, eroded: Sequence[float] = (0.0, 0.0)) -> bool:
+def leaps(before: np.ndarray, after: np.ndarray) -> bool:
     """Return whether a step makes things twice as bad, and so leads nowhere.
 
-    Either a limit, or the objective of a design that keeps all; or the eroded design comes to twice
-    a limit that it need not keep: it is coming apart.
+    Either a limit, or the objective of a design that keeps all.
 
     Args:
         before, after: (1 + m,) values of what is minimised and of the relative limits.
-        eroded: `eroded_share` before and after.
     """
     kept = bool((before[1:] <= EXCESS).all())
     up = kept and after[0] > before[0] + abs(before[0])
     far = 1.0 + after[1:] > 2.0 * (1.0 + np.maximum(before[1:], 0.0))
-    apart = eroded[0] <= 2.0 < eroded[1]
-    return bool(up or far.any() or apart or not np.isfinite(after).all())
+    return bool(up or far.any() or not np.isfinite(after).all())

@@ -122,20 +122,6 @@ def binds(scene: Scene, variant: int, response: str) -> bool:
     return not design.limits_nominal or (variant == 0 and not (declared.of_phase and others))
 
 
-def eroded_share(scene: Scene, designs: Sequence[EvaluatedDesign]) -> float:
-    """Return the largest share of a limit that the eroded design makes, where others keep it.
-
-    Or of the nominal design's value, where that exceeds the limit; 0 where it keeps the limits
-    itself, or there is none.
-    """
-    eroded, nominal = designs[0], designs[-1]
-    if eroded is nominal or not scene.design.limits_nominal:
-        return 0.0
-    asked = np.array([binds(scene, 0, name) for name in eroded.limited], dtype=bool)
-    own, others = (1.0 + np.array(item.evaluation.constraints) for item in (eroded, nominal))
-    return float((own / np.maximum(others, 1.0)).max(initial=0.0, where=asked))
-
-
 def limits_at(scene: Scene, designs: Sequence[EvaluatedDesign]) -> tuple[np.ndarray, ...]:
     """Return the smooth limits of every design, as a step from here holds them.
 
