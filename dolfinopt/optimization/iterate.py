@@ -15,6 +15,7 @@ from dolfinopt.optimization.measured import (
     CURVED_ASYMPTOTE_DISTANCE,
     DECIMALS,
     LEAST_REACH,
+    LIMITS_MEMORY,
     NEWTON_ITERATIONS,
     REACH_GROWTH,
     SHORTER_REACH,
@@ -39,12 +40,14 @@ class Iterate:
         iteration, change: updates made, and the largest change of a variable in the last one.
         reach: factor on the move limit, at most 1.
         residual: of x.
+        held: smooth limits of every design as steps hold them, see `_take`; None: those at x.
         curved: whether limits other than volume and mass are to be kept.
         stuck: why no step leads on from x, "" while one does.
     """
 
     problem: Problem
     designs: list[EvaluatedDesign]
+    held: list[np.ndarray] | None = None
 
     def __init__(self, evaluator: Evaluator, x: np.ndarray):
         """Take what evaluates designs, and the variables (n,)."""
@@ -105,16 +108,27 @@ class Iterate:
         return True
 
     def _restore_best(self) -> None:
+        self.held = None
         if self.best.iteration >= 0:
             self.x = self.best.x.copy()
             self.projection.beta = self.best.beta
 
     def _set(self, designs: list[EvaluatedDesign]) -> None:
         self.designs = designs
-        self.problem = problem_of(self.scene, designs)
+        self.problem = problem_of(self.scene, designs, self.held)
 
     def _take(self, designs: list[EvaluatedDesign]) -> None:
-        """Go on with the designs that x stands for (collective)."""
+        """Go on with the designs that x stands for (collective).
+
+        Their smooth limits are held as the mean over the designs so far, of which the newest
+        counts most: where another cell or instant becomes the worst one, they do not leap. Source:
+        Le, Norato, Bruns, Ha & Tortorelli (2010), doi:10.1007/s00158-009-0440-y, eq. (17).
+        """
+        at_x = limits_at(self.scene, designs)
+        self.held = [
+            old + LIMITS_MEMORY * (new - old)
+            for old, new in zip(self.held or at_x, at_x, strict=True)
+        ]
         self._set(designs)
         self.progress = self.progress.after(self.problem.values[0], self.problem.excess)
         value, excess = float(self.problem.values[0]), self.problem.excess
@@ -175,8 +189,7 @@ class Iterate:
             self.stuck = str(error)
             self.evaluator.undo()
             return None
-        held = limits_at(self.scene, self.designs)
-        tried = problem_of(self.scene, designs, held)
+        tried = problem_of(self.scene, designs, self.held)
         if leaps(self.problem.values, tried.values):
             self.evaluator.undo()
             return None
@@ -253,6 +266,7 @@ class Iterate:
             multipliers=state.multipliers,
             best=self.best,
             progress=self.progress,
+            held=self.held,
             solutions=solutions,
             beta=self.projection.beta,
             **others,
@@ -266,7 +280,7 @@ class Iterate:
         self.best, self.progress = replace(memory.best, x=best), memory.progress
         if self.scene.objective.gradient == "exact":  # which may follow one with frozen loads
             self.evaluator.use_gradient(memory.gradient)
-        self.evaluator.solutions = memory.solutions
+        self.evaluator.solutions, self.held = memory.solutions, memory.held
         for k, arm in self.evaluator.arms.items():
             arm.initial_vectors = memory.modes[k]
         self.iteration, self.change, self.reach = memory.iteration, memory.change, memory.reach

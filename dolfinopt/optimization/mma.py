@@ -25,7 +25,6 @@ import numpy.typing as npt
 
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.measured import (
-    DEPENDENT_SHARE,
     DUAL_EVALUATIONS,
     FIRST_ASYMPTOTE_DISTANCE,
     ROUNDING,
@@ -287,7 +286,7 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
     # is an ascent direction even if the number of rounds runs out.
     m = gradient.size
     # Bounds the step where the dual is flat, or constraints say the same.
-    diagonal = DEPENDENT_SHARE * (np.diag(curvature) + np.abs(gradient)) + _TINY
+    diagonal = ROUNDING * (np.diag(curvature) + np.abs(gradient)) + _TINY
     curvature = curvature + np.diag(diagonal)
     z = np.zeros(m)
     fixed = ((lower == 0.0) & (gradient <= 0.0)) | ((upper == 0.0) & (gradient >= 0.0))
@@ -310,7 +309,7 @@ def _maximise_in_box(gradient: Array, curvature: Array, lower: Array, upper: Arr
         slope = gradient - curvature @ z
         inward = np.where(fixed, np.where(z >= upper, -slope, slope), 0.0)
         k = int(np.argmax(inward))
-        if inward[k] <= DEPENDENT_SHARE * np.abs(gradient).max():
+        if inward[k] <= ROUNDING * np.abs(gradient).max():
             break
         fixed[k] = False
     return z

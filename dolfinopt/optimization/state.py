@@ -170,6 +170,7 @@ class Memory:
         multipliers: MMA's, on all ranks.
         best: the best design so far; its variables are the last column of `cells`.
         progress: the course of the iterations.
+        held: smooth limits of every design, as steps hold them.
         solutions: from which this design's simulations set out; the root's count.
         beta: steepness of the projection.
         history: rows so far.
@@ -189,6 +190,7 @@ class Memory:
     multipliers: np.ndarray
     best: Best
     progress: Progress
+    held: list[np.ndarray] | None
     solutions: tuple[Solution, ...]
     beta: float
     history: list[HistoryRow]
