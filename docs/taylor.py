@@ -9,6 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 import dolfinopt as do
+from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
 from dolfinopt.scene.tables.objective import Constraints
 from dolfinopt.scene.tables.responses import DECLARED
@@ -30,7 +31,7 @@ def tested(name: str) -> TaylorTest:
     for k, arm in arms.items():
         along, across = arm.mesh.centroid.T / arm.mesh.outboard_point[0]
         x[k] = 0.5 + 0.3 * np.sin(7.0 * along + k) + 2.0 * across
-    return taylor_test(scene, partition, arms, x, profile)
+    return taylor_test(Evaluator(scene, partition, arms, profile), x)
 
 
 def row(name: str, test: TaylorTest) -> str:

@@ -13,6 +13,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from math import isfinite
 from pathlib import Path
 from typing import IO, Any
 
@@ -105,6 +106,15 @@ def write_bytes(path: Path, data: bytes) -> None:
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically."""
     write_bytes(path, text.encode())
+
+
+def finite(data: Any) -> Any:
+    """Return JSON data with None in place of numbers that JSON does not have."""
+    if isinstance(data, dict):
+        return {key: finite(item) for key, item in data.items()}
+    if isinstance(data, list):
+        return list(map(finite, data))
+    return None if isinstance(data, float) and not isfinite(data) else data
 
 
 def write_table(path: Path, header: Sequence[str], columns: Any, digits: int) -> None:

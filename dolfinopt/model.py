@@ -54,7 +54,13 @@ from dolfinopt.parallel import Partition, gather_cells, on_root, partition_arms,
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import with_unit
 from dolfinopt.responses.constraints import limits_of
-from dolfinopt.responses.evaluation import constraint_gradients, evaluate, gradient
+from dolfinopt.responses.evaluation import (
+    analysis_of,
+    constraint_gradients,
+    evaluate,
+    gradient,
+    objective_gradient,
+)
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
@@ -290,8 +296,7 @@ class OptimizationResult(SimulationResult):
             return None
         from pandas import DataFrame
 
-        frame = DataFrame([row.values for row in self.rows], columns=self.rows[0].columns)
-        return frame.astype({"iteration": int}).set_index("iteration")
+        return DataFrame([row.figures for row in self.rows]).set_index("iteration")
 
     def plot(self) -> Figure | None:
         """Return the figure of the optimised arms; None but on rank 0, as all figures."""
@@ -434,8 +439,9 @@ class Model:
             choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
         place = self.scene, partition, arms
         evaluation, trajectory = evaluate(*place, x_phys, self._profile, simulated=False)
-        rows = constraint_gradients(*place, trajectory, self._profile, evaluation.responses)
-        by_cells = [gradient(*place, trajectory, self._profile), *rows]
+        analysis = analysis_of(*place, trajectory, self._profile)
+        rows = constraint_gradients(analysis, evaluation.responses)
+        by_cells = [objective_gradient(analysis), *rows]
         zero = {k: np.zeros_like(x_phys[k]) for k in arms}
         names = ["objective", *(limit.name for limit in limits_of(self.scene, evaluation))]
         values = [evaluation.objective, *evaluation.constraints]

@@ -17,6 +17,7 @@ from dolfinopt.arms import arm, design_state
 from dolfinopt.errors import ConvergenceError, InputError, OthersFailed
 from dolfinopt.fem import elasticity, tensors
 from dolfinopt.mesh import arm_mesh as mesh
+from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.gradient_check import taylor_test
 from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import checkpoint, design, run_folder, summary
@@ -203,7 +204,7 @@ def reading_designs(folder):
 def taylor(_):
     built = build(*COARSE)
     x = built.uniform()
-    return lambda: taylor_test(*built.place, x, built.profile)
+    return lambda: taylor_test(Evaluator(*built.place, built.profile), x)
 
 
 EXACT, STATIC = "objective.gradient=exact", "objective.kind=static"

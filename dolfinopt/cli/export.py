@@ -35,7 +35,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import decide_stiffening
 from dolfinopt.responses.linearised_machine import linearised_machine
 from dolfinopt.responses.order_selection import choose_coordinates
-from dolfinopt.scene.load import Scene, pose_scenarios
+from dolfinopt.scene.load import Scene
 from dolfinopt.scene.sid import sid_arrays, write_sid
 
 KINDS = (".sid", ".sid.npz", ".fem")
@@ -54,7 +54,7 @@ def export_bodies(
     with together(world):
         for k, arm in arms.items():
             arm.state(x_phys[k])
-    decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
+    decide_stiffening(scene, partition, arms)
     exported = {k: _exported(arm, scene.arms[k].thickness, x_phys[k]) for k, arm in arms.items()}
     bodies = gather_arms(partition, exported)
     if world.rank != 0:

@@ -207,9 +207,10 @@ def gradient(
 
 def _check_gradient(world: MPI.Comm, place: Designed, profile: Profile) -> None:
     """Print the Taylor test; raise ConvergenceError where a rate is too low."""
+    from dolfinopt.optimization.evaluator import Evaluator
     from dolfinopt.optimization.gradient_check import STEPS, taylor_test
 
-    test = taylor_test(*place, profile)
+    test = taylor_test(Evaluator(*place[:3], profile), place.x_phys)
     if world.rank == 0:
         steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
         click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")

@@ -22,7 +22,12 @@ from dolfinopt.optimization.measured import NEWTON_ITERATIONS
 from dolfinopt.parallel import together
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import Evaluation, evaluate
-from dolfinopt.responses.order_selection import Comparison, OrderSelection, choose_coordinates
+from dolfinopt.responses.order_selection import (
+    Comparison,
+    OrderSelection,
+    Reductions,
+    choose_coordinates,
+)
 from dolfinopt.responses.response import constraints_of, needs
 from dolfinopt.scene.tables.responses import STATICS, limited_by
 
@@ -71,7 +76,8 @@ def assess(
     elif selection is not None:
         error = np.inf  # of a richer motion that cannot be simulated; the design is not lost for it
         with suppress(ConvergenceError):
-            error = Comparison(*place, evaluator.profile).error(selection.coordinates)
+            known = Reductions(*place[:3], evaluator.profile)
+            error = Comparison(known, x_phys).error(selection.coordinates)
         selection = replace(selection, error=error)
     # A followed mode is known by those before it: the initial and the crisp design's are not.
     vectors = {k: arm.initial_vectors for k, arm in arms.items()}

@@ -61,11 +61,11 @@ class Certificate:
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return its entry of summary.json; what is unknown is None."""
+        """Return its entry of summary.json."""
         return {
-            "kkt": _known(self.kkt),
-            "gradient_angle": _known(self.angle),
-            "gradient_ratio": _known(self.ratio),
+            "kkt": self.kkt,
+            "gradient_angle": self.angle,
+            "gradient_ratio": self.ratio,
             "feasible": not self.violated,
             "missing": self.missing,
             "stationary": self.stationary,
@@ -162,7 +162,3 @@ def _problem_by(
     else:
         designs = [other.differentiated(nominal.physical, nominal.evaluation)]
     return problem_of(other.scene, designs)
-
-
-def _known(value: float) -> float | None:
-    return value if np.isfinite(value) else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,8 +17,14 @@ from dolfinopt.optimization.projection import Projection
 from dolfinopt.optimization.variables import Variables
 from dolfinopt.parallel import Partition, together
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.evaluation import Evaluation, constraint_gradients, evaluate, gradient
-from dolfinopt.responses.response import CellGradient
+from dolfinopt.responses.evaluation import (
+    Evaluation,
+    analysis_of,
+    constraint_gradients,
+    evaluate,
+    objective_gradient,
+)
+from dolfinopt.responses.response import Analysis, CellGradient
 from dolfinopt.scene.law_variables import LAW, with_law
 from dolfinopt.scene.load import Scene
 
@@ -160,18 +166,19 @@ class Evaluator:
         if self.trajectory is not None:
             self.solutions = self.trajectory.solutions
         variant = variants_of(self.scene)[-1] if variant is None else variant
-        asked = partial(binds, self.scene, variant)
-        rows = constraint_gradients(*self._analysed, evaluation.responses, asked=asked)
-        by_x = self._by_variables(design, [gradient(*self._analysed), *rows])
+        analysis, asked = self._analysis, partial(binds, self.scene, variant)
+        rows = constraint_gradients(analysis, evaluation.responses, asked)
+        by_x = self._by_variables(design, [objective_gradient(analysis), *rows])
         return EvaluatedDesign(design, evaluation, by_x[0], by_x[1:])
 
     def objective_gradient(self, design: Mapping[int, PhysicalDesign]) -> np.ndarray:
         """Return the objective's gradient (n,) by x of the design evaluated last (collective)."""
-        return self._by_variables(design, [gradient(*self._analysed)])[0]
+        return self._by_variables(design, [objective_gradient(self._analysis)])[0]
 
     @property
-    def _analysed(self) -> tuple[Any, Any, Any, Any, Any]:
-        return self.scene, self.partition, self.arms, self.trajectory, self.profile
+    def _analysis(self) -> Analysis:
+        place = self.scene, self.partition, self.arms
+        return analysis_of(*place, self.trajectory, self.profile)
 
     def _by_variables(
         self, design: Mapping[int, PhysicalDesign], by_cells: Sequence[CellGradient]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -29,18 +29,13 @@ from dolfinopt.optimization.measured import (
 from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.optimization.stopping import StopCode, conflicts, ending, stop_code
-from dolfinopt.parallel import Partition, together
-from dolfinopt.profiling import Profile
+from dolfinopt.parallel import together
 from dolfinopt.progress import log
 from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.evaluation import Evaluation, reconsider_stiffening
 from dolfinopt.responses.order_selection import OrderSelection, choose_coordinates
 from dolfinopt.responses.response import needs
-from dolfinopt.scene.load import Scene, pose_scenarios
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
-
+from dolfinopt.scene.load import Scene
 
 Report = Callable[[HistoryRow], None]
 
@@ -58,58 +53,37 @@ class Recorder(Protocol):
         """Keep what the run needs to go on from here."""
 
 
-def run(
-    scene: Scene,
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    profile: Profile,
-    *,
-    memory: Memory | None = None,
-    recorder: Recorder | None = None,
-    report: Report | None = None,
-    compared: bool = False,
-    x0: Mapping[int, np.ndarray] | None = None,
-) -> RankResult:
-    """Optimise the scene's arms (collective).
-
-    An iteration: filter -> reduce -> simulate -> load cases -> gradient -> MMA.
-
-    Args:
-        scene: what to optimise.
-        partition, arms, profile: which ranks do which arm, this rank's arms, seconds and counts.
-        memory: of a run that goes on.
-        recorder: keeps history and memory.
-        report: called on the root with every row of the history.
-        compared: look at solid arms before, and at bars of the same mass after the iterations,
-            where these are many enough for it to cost at most a twentieth.
-        x0: design variables (n_cells,) of this rank's arms to begin with; None: the scene's.
-
-    Raises:
-        ConvergenceError: a simulation failed.
-    """
-    compared = compared and scene.optimizer.max_iterations >= 2 * WINDOW
-    evaluator = Evaluator(scene, partition, arms, profile)
-    return _Run(evaluator, recorder, report, compared, x0).go(memory)
-
-
 def begins_with_frozen_loads(scene: Scene) -> bool:
     """Return whether the exact gradient takes over from one with frozen loads."""
     return scene.objective.gradient == "exact" and scene.objective.has_esl_gradient
 
 
-class _Run:
-    """One optimisation under way."""
+class Optimization:
+    """One optimisation under way.
+
+    An iteration: filter -> reduce -> simulate -> load cases -> gradient -> MMA.
+    """
 
     def __init__(
         self,
         evaluator: Evaluator,
-        recorder: Recorder | None,
-        report: Report | None,
-        compared: bool,
-        x0: Mapping[int, np.ndarray] | None,
+        recorder: Recorder | None = None,
+        report: Report | None = None,
+        compared: bool = False,
+        x0: Mapping[int, np.ndarray] | None = None,
     ) -> None:
+        """Take what is to be optimised (collective).
+
+        Args:
+            evaluator: of the arms.
+            recorder: keeps history and memory.
+            report: called on the root with every row of the history.
+            compared: look at solid arms before, and at bars of the same mass after the iterations,
+                where these are many enough for it to cost at most a twentieth.
+            x0: design variables (n_cells,) of this rank's arms to begin with; None: the scene's.
+        """
         self.evaluator, self.recorder, self.report = evaluator, recorder, report
-        self.compared = compared  # whether to look at solid arms and bars
+        self.compared = compared and evaluator.scene.optimizer.max_iterations >= 2 * WINDOW
         self.solid: tuple[Limit, ...] = ()  # what solid arms make of the limits
         self.scene, self.profile = evaluator.scene, evaluator.profile
         self.partition, self.arms = evaluator.partition, evaluator.arms
@@ -130,8 +104,15 @@ class _Run:
         self.seconds_before = 0.0  # spent before a resume
         self.begun = self.saved = time.perf_counter()
 
-    def go(self, memory: Memory | None) -> RankResult:
-        """Iterate until the design gains no more or the iterations are spent."""
+    def go(self, memory: Memory | None = None) -> RankResult:
+        """Iterate until the design gains no more or the iterations are spent (collective).
+
+        Args:
+            memory: of a run that goes on.
+
+        Raises:
+            ConvergenceError: a simulation failed.
+        """
         if memory is None:
             self._begin()
         else:
@@ -221,8 +202,7 @@ class _Run:
         with together(self.world):
             for k, arm in self.arms.items():
                 arm.state(self.iterate.nominal.x_phys[k])
-        group = [self.scene, *pose_scenarios(self.scene)]
-        if not reconsider_stiffening(group, self.partition, self.arms):
+        if not reconsider_stiffening(self.scene, self.partition, self.arms):
             return False
         if not self.iterate.begin_anew():
             for arm in self.arms.values():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -48,33 +49,21 @@ class HistoryRow:
     tightest: str = field(default="", compare=False, repr=False)
 
     @property
-    def columns(self) -> list[str]:
-        """Names of `values`, the header of history.csv."""
-        own = [f.name for f in fields(self)][:-3]
-        return (
-            own
-            + list(self.constraints)
-            + [f"{MULTIPLIER}{multiplier}" for multiplier in self.multipliers]
-        )
-
-    @property
-    def values(self) -> list[float]:
-        """The row of history.csv."""
-        own = astuple(self)[:-3]
-        return [*own, *self.constraints.values(), *self.multipliers.values()]
+    def figures(self) -> dict[str, float]:
+        """Its values by the heads of their columns of history.csv."""
+        own = {item.name: getattr(self, item.name) for item in fields(self)[:-3]}
+        shares = {MULTIPLIER + name: value for name, value in self.multipliers.items()}
+        return own | dict(self.constraints) | shares
 
     @classmethod
-    def from_values(cls, columns: Sequence[str], values: Sequence[float]) -> HistoryRow:
-        """Return the row of which `columns` and `values` are."""
-        pairs, count = list(zip(columns, map(float, values), strict=True)), len(fields(cls)) - 3
-        own, figures, size = dict(pairs[:count]), dict(pairs[count:]), len(MULTIPLIER)
-        # Columns by name: one by one they would hide what mypy can check.
-        return cls(
-            iteration=int(own.pop("iteration")),
-            constraints={k: x for k, x in figures.items() if not k.startswith(MULTIPLIER)},
-            multipliers={k[size:]: x for k, x in figures.items() if k.startswith(MULTIPLIER)},
-            **own,  # type: ignore[arg-type]
-        )
+    def from_figures(cls, figures: Mapping[str, float]) -> HistoryRow:
+        """Return the row of which `figures` are."""
+        rest = dict(figures)
+        own: dict[str, Any] = {item.name: rest.pop(item.name) for item in fields(cls)[:-3]}
+        own["iteration"] = int(own["iteration"])
+        shares = {name: rest.pop(name) for name in figures if name.startswith(MULTIPLIER)}
+        multipliers = {name.removeprefix(MULTIPLIER): x for name, x in shares.items()}
+        return cls(**own, constraints=rest, multipliers=multipliers)
 
 
 # -- what an optimisation must remember to go on as if it had never been interrupted -------------

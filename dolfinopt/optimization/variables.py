@@ -41,20 +41,13 @@ class Variables:
         first = {k: end + before for k, end in zip(every, ends, strict=False)}
         self.size: int = ends[-1]
         self._parts = {k: slice(first[k], first[k] + size) for k, size in sizes.items()}
-        meshes = {k: arm.mesh for k, arm in self.arms.items()}
-        least, (low, high) = scene.design.minimum, law_bounds(scene)
-        self.law_bounds = low, high
-        none, all_of_it = np.zeros(len(low)), np.ones(len(low))
-        self.xmin = self.join(
-            {k: m.keep(np.full(sizes[k], least)) for k, m in meshes.items()} | {LAW: none}
-        )
-        self.xmax = self.join(
-            {k: m.keep(np.ones(sizes[k])) for k, m in meshes.items()} | {LAW: all_of_it}
-        )
+        low, high = self.law_bounds = law_bounds(scene)
         start = (law_values(scene) - low) / (high - low)
-        self.initial = self.join(
-            {k: np.full(sizes[k], scene.initial(k)) for k in meshes} | {LAW: start}
-        )
+        columns = {LAW: np.column_stack([0.0 * low, np.ones_like(low), start])}
+        for k, arm in self.arms.items():
+            bounds = [arm.mesh.keep(np.full(sizes[k], x)) for x in (scene.design.minimum, 1.0)]
+            columns[k] = np.column_stack([*bounds, np.full(sizes[k], scene.initial(k))])
+        self.xmin, self.xmax, self.initial = np.ascontiguousarray(self.join(columns).T)
 
     def split(self, x: np.ndarray) -> dict[int, np.ndarray]:
         """Return the parts of this rank's arms, and under `LAW` the law's."""

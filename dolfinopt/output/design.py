@@ -482,8 +482,8 @@ def append_history(path: Path, row: HistoryRow) -> None:
 
 
 def _lines(rows: Sequence[HistoryRow], headed: bool) -> str:
-    lines = [rows[0].columns] * headed
-    lines += [[f"{value:.10g}" for value in row.values] for row in rows]
+    lines = [list(rows[0].figures)] * headed
+    lines += [[f"{value:.10g}" for value in row.figures.values()] for row in rows]
     return "".join(",".join(line) + "\n" for line in lines)
 
 
@@ -491,4 +491,4 @@ def read_history(path: Path) -> list[HistoryRow]:
     """Read history.csv back."""
     with open_input(path) as stream:
         header, *rows = csv.reader(stream.read().decode().splitlines())
-        return [HistoryRow.from_values(header, list(map(float, row))) for row in rows]
+        return [HistoryRow.from_figures(dict(zip(header, map(float, row)))) for row in rows]

@@ -17,8 +17,8 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.errors import InputError
-from dolfinopt.optimization import loop
-from dolfinopt.optimization.loop import Report
+from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.loop import Optimization, Report
 from dolfinopt.optimization.result import RankResult, simulation_result
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
@@ -174,7 +174,7 @@ def optimize(
         report: called on the root with every row of the history.
         built: which ranks do which arm, and this rank's, without a design yet; None: they are
             meshed.
-        compared, x0: see `loop.run`.
+        compared, x0: see `loop.Optimization`.
 
     Raises:
         InputError: `resume` without a matching checkpoint; the folder holds results, and neither
@@ -211,13 +211,5 @@ def optimize(
                 kept = (checkpoint.NAME, HISTORY)
                 on_root(world, partial(remove_stale, keep=kept), folder)
             recorder = FolderRecorder(folder, scene, *built)
-        return loop.run(
-            scene,
-            *built,
-            profile,
-            memory=memory,
-            recorder=recorder,
-            report=report,
-            compared=compared,
-            x0=x0,
-        )
+        evaluator = Evaluator(scene, *built, profile)
+        return Optimization(evaluator, recorder, report, compared, x0).go(memory)

@@ -17,7 +17,7 @@ from dolfinopt.arms.arm import Arm, stiffening_of
 from dolfinopt.density.contacts import Contacts
 from dolfinopt.density.measured import GREY
 from dolfinopt.density.members import Width, Widths, widths_of
-from dolfinopt.disk import write_text
+from dolfinopt.disk import finite, write_text
 from dolfinopt.dynamics.budget import deflection_budget
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.mesh import compat
@@ -79,7 +79,7 @@ def summarise(
     with together(partition.world):
         if trajectory is None:  # this is not the root
             return {}
-        return {
+        result = {
             "name": scene.name,
             **_figures(run.evaluation),
             **_machine(trajectory),
@@ -104,7 +104,7 @@ def summarise(
             "stop_code": run.stop_code.value,
             "stop_reason": run.stop_reason,
             "exact_from": run.exact_from,
-            "kkt": _finite(run.kkt),
+            "kkt": run.kkt,
             "certificate": None if run.certificate is None else run.certificate.to_dict(),
             **({} if run.bars is None else {"bars": _bars(run)}),
             **cost,
@@ -112,6 +112,7 @@ def summarise(
             "versions": versions(),
             "scene": scene.to_dict(),
         }
+        return dict(finite(result))
 
 
 def figures(run: RankResult, wall: float) -> dict[str, Any]:
@@ -531,14 +532,10 @@ def _reduction(scene: Scene, choice: OrderSelection | None) -> dict[str, Any]:
     if choice is None:
         return {"coordinates": scene.reduction.coordinates, "error_estimate": None, "tried": []}
     rows = [
-        {"coordinates": count, "error_estimate": _finite(error)}
+        {"coordinates": count, "error_estimate": error}
         for count, error in ((choice.coordinates, choice.error), *choice.tried)
     ]
     return {**rows[0], "tried": rows[1:]}
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 def _too_few(scene: Scene, choice: OrderSelection | None) -> Iterator[str]:

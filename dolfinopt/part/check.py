@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
+from dolfinopt.disk import finite
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.output.design import ArmView, gather_views
@@ -28,6 +29,9 @@ from dolfinopt.part.folder import scene_data, toml_text
 from dolfinopt.part.stress import HOT, PartStress, stress_of_parts
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of
+from dolfinopt.responses.evaluation import analysis_of
+from dolfinopt.responses.products import by_nodes
+from dolfinopt.responses.response import Analysis
 from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report, unjudged
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.toml import tomllib
@@ -82,6 +86,12 @@ class Simulated:
     x_phys: Mapping[int, np.ndarray]
     evaluation: Evaluation
     trajectory: Trajectory
+
+    @property
+    def analysis(self) -> Analysis:
+        """What responses and their gradients by the places of nodes are computed from."""
+        place = self.scene, self.partition, self.arms
+        return analysis_of(*place, self.trajectory, Profile(), by_nodes)
 
 
 def simulate_parts(
@@ -505,14 +515,7 @@ class Check:
                 "warnings": self.warnings,
             },
         }
-        return dict(_finite(result))
-
-
-def _finite(value: Any) -> Any:
-    """Return JSON data without numbers that JSON does not have."""
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+        return dict(finite(result))
 
 
 def _word(change: Mapping[str, float]) -> str:

@@ -15,10 +15,8 @@ from dolfinopt.part.check import STRESS, Simulated, simulate_parts
 from dolfinopt.part.mesh import PlateMesh
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.stress import HOT, CornerStress, OutlineStress
-from dolfinopt.profiling import Profile
 from dolfinopt.responses.constraints import Limit, limits_of
-from dolfinopt.responses.evaluation import analysis_of, constraint_gradients, gradient
-from dolfinopt.responses.products import by_nodes
+from dolfinopt.responses.evaluation import constraint_gradients, objective_gradient
 from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress import arm_loads, maxima, motions_of
 from dolfinopt.scene.load import Scene
@@ -213,8 +211,7 @@ class Problem:
             for k, item in state.stress.items()
         }
         response = OutlineStress(options, lambda k, _: points[k])
-        given = run.scene, run.partition, run.arms, run.trajectory, Profile(), by_nodes
-        (row,) = response.gradients(analysis_of(*given))
+        (row,) = response.gradients(run.analysis)
         scale = (1.0 + state.places[arm, piece]) / state.means[arm, piece]
         return {k: scale * g for k, g in row.items()}
 
@@ -272,13 +269,10 @@ class Problem:
     def slopes(self, state: State) -> np.ndarray:
         """Return the derivatives (1 + m, n) of the values by the variables x of all outlines."""
         simulated = state.simulated
-        place = simulated.scene, simulated.partition, simulated.arms
-        given = *place, simulated.trajectory, Profile()
         sign = -1.0 if objective_of(self.scene).turned else 1.0
-        rows = [{k: sign * g for k, g in gradient(*given, by_nodes).items()}]
+        rows = [{k: sign * g for k, g in objective_gradient(simulated.analysis).items()}]
         every = limits_of(simulated.scene, simulated.evaluation)
-        measured = simulated.evaluation.responses
-        result = constraint_gradients(*given, measured, by_nodes)
+        result = constraint_gradients(simulated.analysis, simulated.evaluation.responses)
         for limit, row in zip(every, result, strict=True):
             if limit.quantity not in ("volume_fraction", STRESS):
                 rows.append({k: self._factor(limit) * g for k, g in row.items()})

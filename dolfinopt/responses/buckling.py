@@ -13,7 +13,7 @@ Source: Ferrari & Sigmund (2019), doi:10.1007/s00158-019-02253-3.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -41,7 +41,7 @@ from dolfinopt.responses.response import (
     response,
 )
 from dolfinopt.responses.sensitivity import pairs_at_interfaces
-from dolfinopt.responses.stress import ArmGradient, ArmLoads, ByLoads, arm_loads, through_motions
+from dolfinopt.responses.stress import ArmGradient, ArmLoads, arm_loads, through_motions
 
 # -- the instants of one arm along one motion at which it comes closest to buckling ---------------
 
@@ -207,9 +207,8 @@ def _gradient_of_arm(
     load_stress = Prestress(fields, stressed_modulus(state), a).gradient(modes, by_K0)
     pair = (modes * (-by_mu * mu), modes)
     by_loads = [
-        ByLoads(to.motion, to.place, np.array([each.instant]), by[None] / to.stiffer)
+        replace(each.loads.at([each.instant]), coefficients=by[None] / each.loads.stiffer)
         for (each, _), by in zip(counted, load_stress.by_a, strict=True)
-        for to in [each.loads]
     ]
     products = Products(
         stiffness=(pair, (load_stress.y, load_stress.stress.u)),

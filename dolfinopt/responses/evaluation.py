@@ -120,12 +120,13 @@ def evaluate(
             arm.state(x_phys[index])
     motion, trajectory = Motion(), None
     if simulated or needs(scene, "motion"):
-        scenes = [scene, *pose_scenarios(scene)]
-        decide_stiffening(scenes, partition, arms)
+        decide_stiffening(scene, partition, arms)
         with together(partition.world):
             bodies = {index: arm.reduce(x_phys[index]) for index, arm in arms.items()}
         owned = gather_arms(partition, bodies)
-        trajectory = simulated_together(scenes, partition, owned, profile, start)
+        trajectory = simulated_together(
+            [scene, *pose_scenarios(scene)], partition, owned, profile, start
+        )
         with profile.phase("objective"):
             motion = on_root(partition.world, _motion, trajectory)
     analysis = analysis_of(scene, partition, arms, trajectory, profile)
@@ -170,7 +171,7 @@ def gradient(
     trajectory: Trajectory | None,
     profile: Profile,
     by: By = by_design,
-) -> dict[int, np.ndarray]:
+) -> CellGradient:
     """Return the objective's gradient by the physical densities of this rank's arms (collective).
 
     Args:
@@ -180,19 +181,18 @@ def gradient(
         profile: of this rank.
         by: `products.by_nodes` for the gradient by the places of the arms' nodes.
     """
-    analysis = analysis_of(scene, partition, arms, trajectory, profile, by)
-    rows = objective_of(scene).gradients(analysis)
+    return objective_gradient(analysis_of(scene, partition, arms, trajectory, profile, by))
+
+
+def objective_gradient(analysis: Analysis) -> CellGradient:
+    """Return the objective's gradient by what the analysis says (collective)."""
+    rows = objective_of(analysis.scene).gradients(analysis)
     return sums(item for row in rows for item in row.items())
 
 
 def constraint_gradients(
-    scene: Scene,
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    trajectory: Trajectory | None = None,
-    profile: Profile | None = None,
+    analysis: Analysis,
     measured: Sequence[Measured] = (),
-    by: By = by_design,
     asked: Callable[[str], bool] = lambda _: True,
 ) -> list[CellGradient]:
     """Return the gradients of `Evaluation.constraints` (collective).
@@ -200,15 +200,12 @@ def constraint_gradients(
     Smooth value / smooth limit - 1, the limit held: its scale follows the design, see `response`.
 
     Args:
-        scene, partition, arms, trajectory, profile: as for `gradient`; the last two are for
-            constraints of the motion alone.
+        analysis: of the design.
         measured: `Evaluation.responses` of the design; measured anew if not given.
-        by: as for `gradient`.
         asked: whether the gradient of a response, by its name, is of any use; else it is left out.
     """
-    analysis = analysis_of(scene, partition, arms, trajectory, profile or Profile(), by)
     result = list[CellGradient]()
-    for k, bound in enumerate(constraints_of(scene), 1):
+    for k, bound in enumerate(constraints_of(analysis.scene), 1):
         values = measured[k] if measured else bound.response.measure(analysis)
         limits = bound.smooth_limits(values)
         rows: list[CellGradient] = [{} for _ in limits]
@@ -284,29 +281,22 @@ def _figures(trajectory: Trajectory) -> Motion:
 # loads change an arm's stiffness by more than `STIFFNESS_CHANGE`
 
 
-def decide_stiffening(
-    scenes: Sequence[Scene], partition: Partition, arms: Mapping[int, Arm]
-) -> None:
+def decide_stiffening(scene: Scene, partition: Partition, arms: Mapping[int, Arm]) -> None:
     """Let the arms' bodies have geometric stiffness from now on, or not (collective).
 
     Decided once, by the design that the arms have, see `reconsider_stiffening`.
 
     Args:
-        scenes: one and its scenarios, which are decided together; the first one says true, false or
-            "auto".
+        scene: says true, false or "auto"; its scenarios are decided with it.
         partition: which ranks do which arm.
         arms: this rank's, with a design.
     """
-    if partition.world.allreduce(all(arm.stiffening is not None for arm in arms.values()), min):
-        return
-    result = _stiffening(scenes, partition, arms)
-    for arm in arms.values():
-        arm.set_stiffening(result)
+    mine = all(arm.stiffening is not None for arm in arms.values())
+    if not partition.world.allreduce(mine, min):
+        _decide(scene, partition, arms)
 
 
-def reconsider_stiffening(
-    scenes: Sequence[Scene], partition: Partition, arms: Mapping[int, Arm]
-) -> bool:
+def reconsider_stiffening(scene: Scene, partition: Partition, arms: Mapping[int, Arm]) -> bool:
     """Switch stiffening on where "auto" left it out and the arms' designs now call for it.
 
     Collective.
@@ -315,28 +305,31 @@ def reconsider_stiffening(
         Whether it was switched on.
     """
     known = partition.world.bcast(stiffening_of(arms), root=0)
-    if scenes[0].simulation.stiffening != "auto" or known is None or known.on:
+    if scene.simulation.stiffening != "auto" or known is None or known.on:
         return False
-    result = _stiffening(scenes, partition, arms)
+    return _decide(scene, partition, arms)
+
+
+def _decide(scene: Scene, partition: Partition, arms: Mapping[int, Arm]) -> bool:
+    result = _stiffening(scene, partition, arms)
     for arm in arms.values():
         arm.set_stiffening(result)
     return result.on
 
 
-def _stiffening(
-    scenes: Sequence[Scene], partition: Partition, arms: Mapping[int, Arm]
-) -> Stiffening:
-    """Return what is decided for scenes of the same arms together (collective)."""
-    stated = scenes[0].simulation.stiffening
-    if stated != "auto" and scenes[0].is_spatial:  # most of a solid arm's memory would go
+def _stiffening(scene: Scene, partition: Partition, arms: Mapping[int, Arm]) -> Stiffening:
+    """Return what is decided for a scene and its scenarios together (collective)."""
+    stated = scene.simulation.stiffening
+    if stated != "auto" and scene.is_spatial:  # most of a solid arm's memory would go
         return Stiffening(None, stated is True)
     with together(partition.world):
         mine = {k: arm.current.static_body for k, arm in arms.items()}
     owned = gather_arms(partition, mine)
 
-    def largest(scene: Scene) -> float:
-        t = np.linspace(0.0, scene.motion.horizon, COARSE_INSTANTS + 1)
-        return largest_stiffness_change(scene, bodies_in(scenes[0], scene, owned), t)
+    def largest(other: Scene) -> float:
+        t = np.linspace(0.0, other.motion.horizon, COARSE_INSTANTS + 1)
+        return largest_stiffness_change(other, bodies_in(scene, other, owned), t)
 
-    change: float = on_root(partition.world, lambda: max(map(largest, scenes)))
+    every = scene, *pose_scenarios(scene)
+    change: float = on_root(partition.world, lambda: max(map(largest, every)))
     return Stiffening(change, change > STIFFNESS_CHANGE if stated == "auto" else stated)

@@ -12,9 +12,7 @@ from dolfinopt.arms.design_state import DesignState
 from dolfinopt.arms.modes import FrozenTree, LoadedModes
 from dolfinopt.motion.build import build_mechanism, rigid_motion
 from dolfinopt.multibody.rigid_motion import RigidMotion
-from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.parallel import on_all_ranks, on_root, together
-from dolfinopt.responses.products import Products
 from dolfinopt.responses.response import (
     Analysis,
     CellGradient,
@@ -84,10 +82,7 @@ class Eigenfrequency(Response):
                 carried = [*zero[:place], matrix, *zero[place + 1 :]]
                 by_body = by_owner(scene, chain.cotangents(carried))
                 row = {
-                    k: rigid_gradient(design, by_body[k], analysis.by)
-                    if _counts(by_body[k])
-                    else analysis.by(design, Products())  # it is not outboard of this place
-                    for k, design in designs.items()
+                    k: rigid_gradient(each, by_body[k], analysis.by) for k, each in designs.items()
                 }
                 owner = scene.owners[place]
                 if owner in row:
@@ -117,11 +112,6 @@ def _frozen(analysis: Analysis) -> FrozenTree:
         return FrozenTree(replace(rigid, forces=()), motion, scene.objective.attached)
 
     return on_root(partition.world, freeze)
-
-
-def _counts(by_body: ShapeIntegrals) -> bool:
-    """Return whether derivatives by a rigid body's integrals are more than zero."""
-    return bool(by_body.mass or by_body.w.any() or by_body.W.any())
 
 
 def _by_place(scene: Scene, designs: Mapping[int, DesignState]) -> dict[int, DesignState]:

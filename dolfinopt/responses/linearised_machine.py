@@ -22,7 +22,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import decide_stiffening
 from dolfinopt.responses.measured import COORDINATES_LIMIT, POLE_ERROR
 from dolfinopt.responses.order_selection import RICHER_METHOD, Reductions, fewest
-from dolfinopt.scene.load import Scene, pose_scenarios
+from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
@@ -54,7 +54,7 @@ def linearised_machine(
     with together(partition.world):
         for k, arm in arms.items():
             arm.state(x_phys[k])
-    decide_stiffening([scene, *pose_scenarios(scene)], partition, arms)
+    decide_stiffening(scene, partition, arms)
     reductions = Reductions(scene, partition, arms, profile)
 
     @cache

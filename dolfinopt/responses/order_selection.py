@@ -78,7 +78,7 @@ def choose_coordinates(
     """
     if scene.reduction.count or not scene.cell_counts:
         return None
-    comparison = Comparison(scene, partition, arms, x_phys, profile)
+    comparison = Comparison(Reductions(scene, partition, arms, profile), x_phys)
     least = max(scene.reduction.fewest_of(arm) for arm in scene.arms)
     goal = scene.reduction.tolerance / reserve
     most = min(max(COORDINATES_LIMIT, least), comparison.reductions.limit)
@@ -115,22 +115,15 @@ class Comparison:
     The arms keep what they have.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        partition: Partition,
-        arms: Mapping[int, Arm],
-        x_phys: Mapping[int, np.ndarray],
-        profile: Profile,
-    ):
-        """Take what `evaluate` does (collective)."""
-        self.partition, self.profile = partition, profile
+    def __init__(self, reductions: Reductions, x_phys: Mapping[int, np.ndarray]):
+        """Take the arms and their physical densities (collective)."""
+        scene, self.partition = reductions.scene, reductions.partition
+        self.reductions = reductions
         self.scenes = [_timed(item) for item in (scene, *pose_scenarios(scene))]
-        with together(partition.world):
-            for k, arm in arms.items():
+        with together(self.partition.world):
+            for k, arm in reductions.arms.items():
                 arm.state(x_phys[k])
-        decide_stiffening(self.scenes, partition, arms)
-        self.reductions = Reductions(scene, partition, arms, profile)
+        decide_stiffening(scene, self.partition, reductions.arms)
         self.richer = 0  # coordinates
         self.bases: dict[int, Basis] = {}
         self.motion: Trajectory | None = None
@@ -164,7 +157,7 @@ class Comparison:
     def _moved(self, bases: Mapping[int, Basis]) -> Trajectory | None:
         """Return the root's motion of the scene with its scenarios (collective)."""
         owned = self.reductions.bodies(bases)
-        return simulated_together(self.scenes, self.partition, owned, self.profile)
+        return simulated_together(self.scenes, self.partition, owned, self.reductions.profile)
 
 
 def _timed(scene: Scene) -> Scene:
@@ -220,8 +213,7 @@ class Reductions:
         self, scene: Scene, partition: Partition, arms: Mapping[int, Arm], profile: Profile
     ) -> None:
         """Take this rank's arms, with a design (collective)."""
-        self.partition, self.arms, self.profile = partition, arms, profile
-        self._damping = scene.damping.stiffness_proportional
+        self.scene, self.partition, self.arms, self.profile = scene, partition, arms, profile
         own = min((arm.elastic.num_dofs for arm in arms.values()), default=maxsize)
         self.limit: int = partition.world.allreduce(own, min)
 
@@ -236,13 +228,13 @@ class Reductions:
 
     def bodies(self, bases: Mapping[int, Basis]) -> dict[int, ShapeIntegrals]:
         """Return the bodies of all arms with these bases, on the root (collective)."""
-        result = {}
+        result, damping = {}, self.scene.damping.stiffness_proportional
         with together(self.partition.world):
             for k, basis in bases.items():
                 arm, loads = self.arms[k], None
                 if arm.stiffened:
                     loads = arm.current.unit_loads.with_modes(basis.V, basis.MV)
-                result[k] = shape_integrals(arm.elastic, basis, self._damping, loads)
+                result[k] = shape_integrals(arm.elastic, basis, damping, loads)
         return gather_arms(self.partition, result)
 
     def energies(

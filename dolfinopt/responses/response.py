@@ -397,7 +397,7 @@ def combined(
 
 
 def p_norm(
-    values: np.ndarray, exponent: float, weights: np.ndarray | None = None
+    values: np.ndarray, exponent: float, weights: np.ndarray | float = 1.0
 ) -> tuple[float, np.ndarray]:
     """Return (sum_k w_k f_k^p)^(1/p) of f >= 0 and its derivative by f (n,).
 
@@ -409,23 +409,19 @@ def p_norm(
     Args:
         values: (n,) f.
         exponent: p, |p| >= 1.
-        weights: (n,) w >= 0; None: 1.
+        weights: (n,) w >= 0, or the same for all.
     """
     largest = values.max() if exponent > 0.0 else values.min()
     if largest == 0.0:
         return 0.0, np.zeros_like(values)
     relative = values / largest
-    powers = relative**exponent
-    total = float(np.sum(powers) if weights is None else weights @ powers)
-    by_values = relative ** (exponent - 1.0) * total ** (1.0 / exponent - 1.0)
-    return (
-        float(largest * total ** (1.0 / exponent)),
-        by_values if weights is None else weights * by_values,
-    )
+    total = float(np.sum(weights * relative**exponent))
+    by_values = weights * relative ** (exponent - 1.0) * total ** (1.0 / exponent - 1.0)
+    return float(largest * total ** (1.0 / exponent)), by_values
 
 
 def p_norm_of_lengths(
-    vectors: np.ndarray, exponent: float, weights: np.ndarray | None = None
+    vectors: np.ndarray, exponent: float, weights: np.ndarray | float = 1.0
 ) -> tuple[float, np.ndarray]:
     """Return the p-norm of the lengths |e_k| and its derivative by the vectors (n, d).
 

@@ -195,7 +195,7 @@ class ArmLoads:
     stiffer: float
     instants: np.ndarray
 
-    def at(self, chosen: np.ndarray) -> ArmLoads:
+    def at(self, chosen: np.ndarray | list[int]) -> ArmLoads:
         """Return those at some of the instants."""
         own = self.coefficients[chosen], self.instants[chosen]
         return replace(self, coefficients=own[0], instants=own[1])
@@ -226,13 +226,13 @@ def load_matrix(body: ShapeIntegrals) -> np.ndarray:
     return np.hstack([frame.T, body.outboard.T, elastic])
 
 
-def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ByLoads]) -> Followed:
+def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ArmLoads]) -> Followed:
     """Differentiate a function of one motion's `ArmLoads.coefficients` by all bodies.
 
     Args:
         scene: nominal, whose arms have the fields that the coefficients are of.
         motion: of it, or of one of its scenarios.
-        by_arms: the function's derivatives.
+        by_arms: the function's derivatives in place of the coefficients.
     """
     mechanism = motion.mechanism
     instants = np.unique(np.concatenate([arm.instants for arm in by_arms]))
@@ -242,7 +242,7 @@ def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ByLoads])
     for arm in by_arms:
         k, rows = arm.place, np.searchsorted(instants, arm.instants)
         body = mechanism.bodies[k]
-        by = arm.by * _scale(scene, motion.scene, k, body)
+        by = arm.coefficients * _scale(scene, motion.scene, k, body)
         by_modes, by_loads = np.split(by, [body.num_modes], axis=1)
         c, P = motion.load_coefficients[k][arm.instants], load_matrix(body)
         z = -np.linalg.solve(body.K, by_modes.T)
@@ -258,8 +258,8 @@ def loads_gradient(scene: Scene, motion: Trajectory, by_arms: Sequence[ByLoads])
 
     def value(moved: Trajectory) -> float:
         return sum(
-            float(np.vdot(item.by, _coefficients(scene, moved, item.place)[item.instants]))
-            for item in by_arms
+            float(np.vdot(by.coefficients, _coefficients(scene, moved, by.place)[by.instants]))
+            for by in by_arms
         )
 
     followed = motion.followed(t, by_rates, by_motion, value)
@@ -428,14 +428,11 @@ class StressedDesign:
     count: int
     sums: PowerSum
 
-    def by_loads(self, by_a: np.ndarray) -> list[ByLoads]:
-        """Return derivatives by all coefficients (k, m), dealt out to the motions."""
+    def by_loads(self, by_a: np.ndarray) -> list[ArmLoads]:
+        """Return derivatives by all coefficients (k, m) in place of these."""
         ends = np.cumsum([len(load.instants) for load in self.loads])[:-1]
-        return [
-            ByLoads(load.motion, load.place, load.instants, by)
-            for load, by in zip(self.loads, np.split(by_a, ends), strict=True)
-            if len(by)
-        ]
+        pairs = zip(self.loads, np.split(by_a, ends), strict=True)
+        return [replace(load, coefficients=by) for load, by in pairs if len(by)]
 
 
 def _by_displacements(stressed: StressedDesign, state: DesignState) -> tuple[np.ndarray, Products]:
@@ -473,33 +470,17 @@ def _frozen_loads(stressed: StressedDesign, state: DesignState, by_u: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class ByLoads:
-    """Derivatives by the loads of one arm along one motion.
-
-    Attributes:
-        motion: its number among `motions_of`.
-        place: of the arm in the chain.
-        instants: (k,) ascending.
-        by: (k, m) by `ArmLoads.coefficients` there.
-    """
-
-    motion: int
-    place: int
-    instants: np.ndarray
-    by: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class ArmGradient:
     """Derivatives of a function of one design and of what loads it.
 
     Attributes:
-        by_loads: of every arm that has the design, along every motion; none where no load counts.
+        by_loads: in place of the coefficients, of every arm that has the design, along every
+            motion; none where no load counts.
         displaced: by displacements, whose coefficients these loads are; None where none counts.
         beside: by the design itself, the sum of what these carry.
     """
 
-    by_loads: Sequence[ByLoads]
+    by_loads: Sequence[ArmLoads]
     displaced: DisplacementGradient | None
     products: tuple[Products, ...]
 

@@ -9,7 +9,7 @@ from solids import DENSITY, POISSON, YOUNG, solid_arm
 from statics import deflection, deflection_gradient
 
 import dolfinopt as do
-from dolfinopt.responses.evaluation import constraint_gradients
+from dolfinopt.responses.evaluation import analysis_of, constraint_gradients
 from dolfinopt.responses.sensitivity import static_response
 
 SELF, WORLD = MPI.COMM_SELF, MPI.COMM_WORLD
@@ -62,7 +62,7 @@ def test_gradients_by_the_wall(changes):
     evaluation, trajectory = built.evaluate(x)
     held = np.array(evaluation.smooth_limits)
     found = [built.gradient(trajectory)]
-    found += constraint_gradients(*built.place, trajectory, built.profile)
+    found += constraint_gradients(analysis_of(*built.place, trajectory, built.profile))
     slopes = [sum(float(row[k] @ along[k]) for k in row) for row in found]
 
     def values(h):

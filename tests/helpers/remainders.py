@@ -14,9 +14,10 @@ from dolfinopt.arms.arm import Arm
 from dolfinopt.fem.elasticity import Substructure
 from dolfinopt.mesh.arm_mesh import box_arm
 from dolfinopt.optimization import gradient_check
+from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.gradient_check import TaylorTest, taylor_test
 from dolfinopt.parallel import Partition, sum_over_arms
-from dolfinopt.responses.evaluation import Evaluation, constraint_gradients
+from dolfinopt.responses.evaluation import Evaluation, analysis_of, constraint_gradients
 from dolfinopt.scene.load import Scene, read_scene
 
 Cells = Mapping[int, np.ndarray]
@@ -47,7 +48,7 @@ class Built:
 
     def constraint_gradients(self, trajectory=None) -> list[dict[int, np.ndarray]]:
         """Return the gradients of `beside_volume` at the design evaluated last."""
-        rows = constraint_gradients(*self.place, trajectory, self.profile)
+        rows = constraint_gradients(analysis_of(*self.place, trajectory, self.profile))
         design, count = self.scene.design, len(self.scene.designed)
         volumes = 1 if design.shared_volume else count
         return rows if design.volume_fraction is None else rows[volumes:]
@@ -179,7 +180,7 @@ def taylor(
                 lambda *told: {name: every(*told)[name] for name in directions},
             )
         x = built.fields(design)
-        return taylor_test(built.scene, built.partition, built.arms, x, built.profile)
+        return taylor_test(Evaluator(*built.place, built.profile), x)
 
 
 def rates(

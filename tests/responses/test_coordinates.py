@@ -15,7 +15,7 @@ from dolfinopt.dynamics.build import simulate
 from dolfinopt.optimization import assessment, measured
 from dolfinopt.output.run_folder import write_result
 from dolfinopt.responses import order_selection as coordinates
-from dolfinopt.responses.order_selection import Comparison
+from dolfinopt.responses.order_selection import Comparison, Reductions
 
 WORLD = MPI.COMM_WORLD
 AUTO = 'reduction.coordinates="auto"'
@@ -29,7 +29,7 @@ def auto(*overrides, tolerance=1e-2, cells=(24, 3)):
 
 
 def error(built, x, count):
-    return Comparison(*built.place, x, built.profile).error(count)
+    return Comparison(Reductions(*built.place, built.profile), x).error(count)
 
 
 def choose(built, x):

@@ -10,7 +10,7 @@ from runs import TWO_ARM, refused
 
 import dolfinopt as do
 from dolfinopt.multibody.kinematics import end_effector
-from dolfinopt.responses.evaluation import constraint_gradients
+from dolfinopt.responses.evaluation import analysis_of, constraint_gradients
 from dolfinopt.responses.motion import motion_objective
 
 
@@ -223,7 +223,7 @@ def seen(scene_file, *overrides):
     evaluation, trajectory = built.evaluate({k: a.uniform(0.5) for k, a in built.arms.items()})
     place = built.scene, built.partition, built.arms
     rows = [built.gradient(trajectory)]
-    rows += constraint_gradients(*place, trajectory, built.profile)
+    rows += constraint_gradients(analysis_of(*place, trajectory, built.profile))
     return evaluation, rows, trajectory
 
 
