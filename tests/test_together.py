@@ -19,9 +19,8 @@ from dolfinopt.fem import elasticity, tensors
 from dolfinopt.mesh import arm_mesh as mesh
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.gradient_check import taylor_test
-from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import checkpoint, design, run_folder, summary
-from dolfinopt.output.run_folder import write_result
+from dolfinopt.output.run_folder import simulated, write_result
 from dolfinopt.parallel import RaisedElsewhere, _pickled, on_root, together
 from dolfinopt.responses import evaluation, frequency, motion, order_selection, static
 from dolfinopt.responses import order_selection as coordinates
@@ -179,8 +178,8 @@ def resuming(folder):
 def writing(folder):
     built = build(*COARSE)
     x = built.uniform()
-    simulated = simulation_result(*built.place, x, *built.evaluate(x), built.profile)
-    return lambda: write_result(folder, simulated, 1.0)
+    result = simulated(design.Designed(*built.place, x), built.profile)
+    return lambda: write_result(folder, result, 1.0)
 
 
 def writing_designs(folder):

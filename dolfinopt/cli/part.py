@@ -266,5 +266,5 @@ def tell(check: Check) -> None:
     for line in (check.loss, *check.notes):
         click.echo(line)
     for limit in check.part.limits:
-        click.echo(f"limit {'met' if limit.met else 'missed'}: {limit.sentence}")
+        click.echo(f"limit {'met' if limit.met else 'missed'}: {limit.usage}")
     warn(check.warnings)

@@ -76,8 +76,8 @@ def assess(
     elif selection is not None:
         error = np.inf  # of a richer motion that cannot be simulated; the design is not lost for it
         with suppress(ConvergenceError):
-            known = Reductions(*place[:3], evaluator.profile)
-            error = Comparison(known, x_phys).error(selection.coordinates)
+            known = Comparison(Reductions(*place, evaluator.profile))
+            error = known.error(selection.coordinates)
         selection = replace(selection, error=error)
     # A followed mode is known by those before it: the initial and the crisp design's are not.
     vectors = {k: arm.initial_vectors for k, arm in arms.items()}

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 # Of the design variable, from one to the next a quarter as long: remainders of second order fall
 # by 16.
-WAVES = np.sqrt([2.0, 3.0, 5.0])  # 1/um: from cell to cell their phases are as good as random
 STEPS = tuple(0.01 / 4.0**k for k in range(5))
 
 
@@ -160,8 +159,9 @@ def _directions(arms: Mapping[int, Arm]) -> dict[str, dict[int, np.ndarray]]:
     # They are functions of the place, the same on any partition.
 
     def noise(k: int) -> np.ndarray:
-        place = arms[k].mesh.centroid
-        return np.sin(1e6 * place @ WAVES[: place.shape[1]] + k)
+        place = 1e3 * arms[k].mesh.centroid
+        angle = place @ np.array([12.9898, 78.233, 37.719])[: place.shape[1]]
+        return 2.0 * np.modf(np.abs(np.sin(angle + k) * 43758.5453))[0] - 1.0
 
     def smooth(k: int) -> np.ndarray:
         mesh = arms[k].mesh

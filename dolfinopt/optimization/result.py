@@ -13,7 +13,7 @@ from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.optimization.stopping import StopCode
 from dolfinopt.parallel import Partition
 from dolfinopt.profiling import Counts, Profile
-from dolfinopt.responses.constraints import Limit, limits_of, violated
+from dolfinopt.responses.constraints import Limit, violated
 from dolfinopt.responses.evaluation import Evaluation
 from dolfinopt.responses.order_selection import OrderSelection
 from dolfinopt.scene.load import Scene
@@ -112,27 +112,3 @@ class RankResult(Result):
     def history(self) -> list[HistoryRow]:
         """One row a design, the initial one first; on the root only."""
         return self.rows
-
-
-def simulation_result(
-    scene: Scene,
-    partition: Partition,
-    arms: Mapping[int, Arm],
-    x_phys: Mapping[int, np.ndarray],
-    evaluation: Evaluation,
-    trajectory: Trajectory | None,
-    profile: Profile,
-    choice: OrderSelection | None = None,
-) -> RankResult:
-    """Return the result of a simulation, with its limits."""
-    return RankResult(
-        scene=scene,
-        partition=partition,
-        arms=arms,
-        x_phys=x_phys,
-        evaluation=evaluation,
-        trajectory=trajectory,
-        limits=limits_of(scene, evaluation),
-        profile=profile,
-        choice=choice,
-    )

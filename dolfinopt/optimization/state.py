@@ -59,7 +59,8 @@ class HistoryRow:
     def from_figures(cls, figures: Mapping[str, float]) -> HistoryRow:
         """Return the row of which `figures` are."""
         rest = dict(figures)
-        own: dict[str, Any] = {item.name: rest.pop(item.name) for item in fields(cls)[:-3]}
+        names = [item.name for item in fields(cls)[:-3]]
+        own: dict[str, Any] = {name: rest.pop(name) for name in names if name in rest}
         own["iteration"] = int(own["iteration"])
         shares = {name: rest.pop(name) for name in figures if name.startswith(MULTIPLIER)}
         multipliers = {name.removeprefix(MULTIPLIER): x for name, x in shares.items()}

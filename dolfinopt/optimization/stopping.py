@@ -92,11 +92,11 @@ def conflicts(code: StopCode, limits: Sequence[Limit], solid: Sequence[Limit] = 
             return f"solid arms do not keep it either ({', '.join(beyond)}): relax it"
         return "let the optimisation go on (optimizer.max_iterations)"
     *rest, last = sorted(
-        limit.bound
+        limit.words
         for limit in limits
         if limit.excess >= -REACHED_LIMIT_SHARE
         and not (limit.quantity == "volume_fraction" and limit.limit >= 1.0)
     )
     if rest:
         return f"{', '.join(rest)} and {last} conflict: relax one of them"
-    return f"no design near this one meets {last}, whatever its material: relax it"
+    return "no design near this one keeps it, whatever its material: relax it"

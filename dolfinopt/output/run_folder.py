@@ -19,7 +19,7 @@ from mpi4py import MPI
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.loop import Optimization, Report
-from dolfinopt.optimization.result import RankResult, simulation_result
+from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import (
@@ -45,6 +45,7 @@ from dolfinopt.output.summary import summarise, write_budget, write_summary
 from dolfinopt.output.trajectory import write_trajectory
 from dolfinopt.parallel import Partition, on_root, partition_arms, together
 from dolfinopt.profiling import Profile
+from dolfinopt.responses.constraints import limits_of
 from dolfinopt.responses.evaluation import evaluate
 from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.responses.stress_report import ArmStress, stress_report
@@ -114,7 +115,15 @@ def views_of(result: RankResult) -> tuple[list[ArmView], dict[int, ArmStress]]:
 def simulated(design: Designed, profile: Profile) -> RankResult:
     """Return the result of simulating a design (collective)."""
     choice = choose_coordinates(*design, profile)
-    return simulation_result(*design, *evaluate(*design, profile), profile, choice)
+    evaluation, trajectory = evaluate(*design, profile)
+    return RankResult(
+        **design._asdict(),
+        evaluation=evaluation,
+        trajectory=trajectory,
+        limits=limits_of(design.scene, evaluation),
+        profile=profile,
+        choice=choice,
+    )
 
 
 # -- an optimisation in a folder -------------------------------------------------------------

@@ -472,9 +472,7 @@ class Check:
                 "stiff: it is left out of the table"
             )
         result += [
-            f"the part misses a limit: {limit.sentence}"
-            for limit in self.part.limits
-            if not limit.met
+            f"the part misses a limit: {limit.usage}" for limit in self.part.limits if not limit.met
         ]
         return result
 

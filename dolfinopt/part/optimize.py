@@ -69,7 +69,7 @@ class Found:
     @property
     def sentence(self) -> str:
         """What came out, in one line."""
-        missed = [limit.sentence for limit in self.limits if not limit.met]
+        missed = [limit.usage for limit in self.limits if not limit.met]
         kept = "; ".join(missed) if missed else "all limits kept"
         return f"{self.iterations} iterations ({self.ending}), objective {self.value:.4g}, {kept}"
 

@@ -53,12 +53,6 @@ class Limit:
         return self.excess <= EXCESS
 
     @property
-    def sentence(self) -> str:
-        """E.g. "first frequency of arm2: 60.4 Hz, at least 80 Hz required"."""
-        value, limit = (with_unit(x, self.unit) for x in distinct(self.value, self.limit))
-        return f"{self.words}: {value}, {'at least' if self.least else 'at most'} {limit} required"
-
-    @property
     def words(self) -> str:
         """E.g. "first frequency of arm2"."""
         return self.quantity.replace("_", " ") + (f" of {self.arm}" if self.arm else "")
@@ -70,18 +64,16 @@ class Limit:
 
     @property
     def usage(self) -> str:
-        """E.g. "deviation 5.3 of 8 mm: 66 %"; of a lower limit the limit's share of the value."""
+        """E.g. "deviation 5.3 of 8 mm: 66 %"; of a lower limit the limit's share of the value.
+
+        One that is missed with more digits, so that it differs from its limit.
+        """
         (value, limit), unit = shown((self.value, self.limit), self.unit)
         of = "of at least" if self.least else "of"
-        share = limit / value if self.least else value / limit
-        both = with_unit(f"{value:.3g} {of} {limit:.4g}", unit)
-        return f"{self.words} {both}: {100.0 * share:.0f} %"
-
-    @property
-    def bound(self) -> str:
-        """E.g. "first frequency of arm2 >= 80 Hz"."""
-        limit = with_unit(f"{self.limit:g}", self.unit)
-        return f"{self.words} {'>=' if self.least else '<='} {limit}"
+        share = 100.0 * (limit / value if self.least else value / limit)
+        digits, used = (3, f"{share:.0f}") if self.met else (5, f"{share:.4g}")
+        both = with_unit(f"{value:.{digits}g} {of} {limit:.4g}", unit)
+        return f"{self.words} {both}: {used} %"
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of summary.json."""
@@ -92,15 +84,6 @@ class Limit:
             "bound": "least" if self.least else "largest",
             "met": self.met,
         }
-
-
-def distinct(value: float, limit: float) -> tuple[str, str]:
-    """Return both numbers with three digits, or as many as it takes to tell them apart."""
-    for digits in range(3, 17):
-        texts = f"{value:.{digits}g}", f"{limit:g}"
-        if float(texts[0]) != limit:
-            break
-    return texts
 
 
 def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
@@ -138,8 +121,8 @@ def worst_limits(variants: Sequence[Sequence[Limit]]) -> tuple[Limit, ...]:
 
 
 def violated(limits: Sequence[Limit]) -> str:
-    """Return the sentences of all constraints that are not met, in one line; "" if all are."""
-    return "; ".join(limit.sentence for limit in limits if not limit.met)
+    """Return all constraints that are not met, in one line; "" if all are."""
+    return "; ".join(limit.usage for limit in limits if not limit.met)
 
 
 def tightest(limits: Sequence[Limit]) -> str:

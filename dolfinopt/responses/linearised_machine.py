@@ -17,9 +17,8 @@ from dolfinopt.arms.arm import chain_of
 from dolfinopt.dynamics.build import check_instant, simulate, state_space
 from dolfinopt.dynamics.state_space import StateSpace
 from dolfinopt.errors import ConvergenceError
-from dolfinopt.parallel import Partition, on_root, together
+from dolfinopt.parallel import Partition, on_root
 from dolfinopt.profiling import Profile
-from dolfinopt.responses.evaluation import decide_stiffening
 from dolfinopt.responses.measured import COORDINATES_LIMIT, POLE_ERROR
 from dolfinopt.responses.order_selection import RICHER_METHOD, Reductions, fewest
 from dolfinopt.scene.load import Scene
@@ -51,11 +50,7 @@ def linearised_machine(
         ConvergenceError: no number of coordinates holds the poles; or of the simulation.
     """
     check_instant(scene, t)
-    with together(partition.world):
-        for k, arm in arms.items():
-            arm.state(x_phys[k])
-    decide_stiffening(scene, partition, arms)
-    reductions = Reductions(scene, partition, arms, profile)
+    reductions = Reductions(scene, partition, arms, x_phys, profile)
 
     @cache
     def machine(method: str, count: int) -> StateSpace:

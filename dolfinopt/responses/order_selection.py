@@ -78,7 +78,7 @@ def choose_coordinates(
     """
     if scene.reduction.count or not scene.cell_counts:
         return None
-    comparison = Comparison(Reductions(scene, partition, arms, profile), x_phys)
+    comparison = Comparison(Reductions(scene, partition, arms, x_phys, profile))
     least = max(scene.reduction.fewest_of(arm) for arm in scene.arms)
     goal = scene.reduction.tolerance / reserve
     most = min(max(COORDINATES_LIMIT, least), comparison.reductions.limit)
@@ -115,15 +115,11 @@ class Comparison:
     The arms keep what they have.
     """
 
-    def __init__(self, reductions: Reductions, x_phys: Mapping[int, np.ndarray]):
-        """Take the arms and their physical densities (collective)."""
-        scene, self.partition = reductions.scene, reductions.partition
-        self.reductions = reductions
+    def __init__(self, reductions: Reductions):
+        """Take the arms with their design."""
+        self.reductions, self.partition = reductions, reductions.partition
+        scene = reductions.scene
         self.scenes = [_timed(item) for item in (scene, *pose_scenarios(scene))]
-        with together(self.partition.world):
-            for k, arm in reductions.arms.items():
-                arm.state(x_phys[k])
-        decide_stiffening(scene, self.partition, reductions.arms)
         self.richer = 0  # coordinates
         self.bases: dict[int, Basis] = {}
         self.motion: Trajectory | None = None
@@ -210,10 +206,19 @@ class Reductions:
     """
 
     def __init__(
-        self, scene: Scene, partition: Partition, arms: Mapping[int, Arm], profile: Profile
+        self,
+        scene: Scene,
+        partition: Partition,
+        arms: Mapping[int, Arm],
+        x_phys: Mapping[int, np.ndarray],
+        profile: Profile,
     ) -> None:
-        """Take this rank's arms, with a design (collective)."""
+        """Take what `evaluate` does (collective)."""
         self.scene, self.partition, self.arms, self.profile = scene, partition, arms, profile
+        with together(partition.world):
+            for k, arm in arms.items():
+                arm.state(x_phys[k])
+        decide_stiffening(scene, partition, arms)
         own = min((arm.elastic.num_dofs for arm in arms.values()), default=maxsize)
         self.limit: int = partition.world.allreduce(own, min)
 

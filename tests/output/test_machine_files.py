@@ -10,9 +10,9 @@ from remainders import built_of
 from runs import TWO_ARM, by_root, contents, summary_of
 
 import dolfinopt as do
-from dolfinopt.optimization.result import simulation_result
 from dolfinopt.output import run_folder as results
-from dolfinopt.output.run_folder import views_of, write_result
+from dolfinopt.output.design import Designed
+from dolfinopt.output.run_folder import simulated, views_of, write_result
 
 WORLD = MPI.COMM_WORLD
 
@@ -21,8 +21,8 @@ def left_by(scene, folder):
     """Return trajectory.npz, trajectory.csv, summary.json, trajectory; both files hold the same."""
     built = built_of(scene)
     x = built.uniform()
-    evaluation, trajectory = built.evaluate(x)
-    one = simulation_result(*built.place, x, evaluation, trajectory, built.profile)
+    one = simulated(Designed(*built.place, x), built.profile)
+    trajectory = one.trajectory
     write_result(folder, one, 0.0, paraview=False)
     with np.load(folder / "trajectory.npz") as data:
         arrays = {name: data[name] for name in data.files}
@@ -156,10 +156,9 @@ def result():
     return do.optimize(do.load_scene(TWO_ARM, SMALL))
 
 
-def simulated(result):
-    profile = do.Profile()
+def simulated_again(result):
     design = do.load_scene(TWO_ARM, SMALL), result.partition, result.arms, result.x_phys
-    return simulation_result(*design, *do.evaluate(*design, profile), profile)
+    return simulated(Designed(*design), do.Profile())
 
 
 @pytest.mark.parametrize("paraview", [True, False])
@@ -168,7 +167,7 @@ def test_files(result, shared_tmp_path, paraview):
     by_root(lambda: (one.mkdir(), other.mkdir()))
     scene = do.load_scene(TWO_ARM, SMALL)
     first, (views, _) = write_result(one, result, 12.5, paraview=paraview), views_of(result)
-    second = write_result(other, simulated(result), 2.5, paraview=paraview)
+    second = write_result(other, simulated_again(result), 2.5, paraview=paraview)
     if WORLD.rank > 0:
         assert first is None and second is None
         return
@@ -212,7 +211,7 @@ def test_summary_comes_last(result, shared_tmp_path, monkeypatch):
         raise OSError("disk full")
 
     monkeypatch.setattr(results, "write_trajectory", fail)
-    one = simulated(result)
+    one = simulated_again(result)
     with pytest.raises(OSError, match="disk full"):
         write_result(shared_tmp_path, one, 1.0)
     assert not (shared_tmp_path / "summary.json").exists()

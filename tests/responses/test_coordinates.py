@@ -29,7 +29,7 @@ def auto(*overrides, tolerance=1e-2, cells=(24, 3)):
 
 
 def error(built, x, count):
-    return Comparison(Reductions(*built.place, built.profile), x).error(count)
+    return Comparison(Reductions(*built.place, x, built.profile)).error(count)
 
 
 def choose(built, x):

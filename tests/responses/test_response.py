@@ -158,7 +158,7 @@ def test_p_norm(scale, exponent):
     assert mean <= values.max()
     h = 1e-6 * scale
     for k in range(5):
-        for w, derivative in ((None, by_values), (weights, p_norm(values, exponent, weights)[1])):
+        for w, derivative in ((1.0, by_values), (weights, p_norm(values, exponent, weights)[1])):
             there, back = (p_norm(values + s * h * np.eye(5)[k], exponent, w)[0] for s in (1, -1))
             assert derivative[k] == pytest.approx((there - back) / (2.0 * h), abs=1e-7)
     vectors = values[:, None] * [0.6, 0.8]
