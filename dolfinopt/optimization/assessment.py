@@ -8,17 +8,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
-from dolfinopt.arms.arm import uniform_design
+from dolfinopt.arms.arm import Arm, uniform_design
 from dolfinopt.dynamics.build import Trajectory
-from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
-from dolfinopt.optimization.measured import NEWTON_ITERATIONS
 from dolfinopt.parallel import together
 from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import Evaluation, evaluate
@@ -30,9 +27,6 @@ from dolfinopt.responses.order_selection import (
 )
 from dolfinopt.responses.response import constraints_of, needs
 from dolfinopt.scene.tables.responses import STATICS, limited_by
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,15 +92,14 @@ def assess(
 def _crisp(evaluator: Evaluator, x_phys: Mapping[int, np.ndarray]) -> Evaluation | None:
     """Return the evaluation of the design cut at 1/2, contacts opened; None if it falls apart."""
     # The same on all ranks.
-    arms, trajectory = evaluator.arms, evaluator.trajectory
+    arms = evaluator.arms
     with together(evaluator.partition.world):
         result = {k: arms[k].contacts(x > 0.5) for k, x in x_phys.items()}
     joined = all(item.joins for item in result.values())
     if not evaluator.partition.world.allreduce(joined, MPI.MIN):
         return None
     cut = {k: np.where(item.kept, 1.0, 0.0) for k, item in result.items()}
-    steps = sum(len(solution.a) for solution in trajectory.solutions) if trajectory else np.inf
-    with suppress(ConvergenceError), counted(NEWTON_ITERATIONS * steps):
+    with suppress(ConvergenceError), evaluator.bounded():
         return evaluator.evaluate_densities(cut, simulated=True)
     return None
 
@@ -152,10 +145,8 @@ def solid_sentence(limits: Sequence[Limit]) -> str:
 
     Only loads that no mass adds to tell that: under inertia lighter arms may keep the limit.
     """
-    parts = []
-    for limit in limits:
-        never = not limit.met and limited_by(limit.quantity).needs == STATICS
-        parts.append(limit.usage + " (cannot be kept)" * never)
+    never = [not item.met and limited_by(item.quantity).needs == STATICS for item in limits]
+    parts = [item.usage + " (cannot be kept)" * out for item, out in zip(limits, never)]
     return f"solid arms: {', '.join(parts)}"
 
 

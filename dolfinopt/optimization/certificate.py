@@ -8,7 +8,7 @@ doi:10.1007/s00158-017-1884-0.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -32,9 +32,9 @@ class Certificate:
 
     Attributes:
         kkt: Karush-Kuhn-Tucker residual under it, see `residual.kkt_residual`; nan if unknown.
-        angle, ratio: of the objective's gradient with frozen loads beside the exact one, over the
-            variables that no bound holds: degrees, and length over length. nan where nothing is
-            frozen, or no variable is free.
+        gradient_angle, gradient_ratio: of the objective's gradient with frozen loads beside the
+            exact one, over the variables that no bound holds: degrees, and length over length. nan
+            where nothing is frozen, or no variable is free.
         missing: why there is no exact gradient, "" if there is one.
         violated: the constraints that the design does not keep, "" if it keeps all.
         stationary: whether the residual is at most `optimizer.kkt_tolerance`.
@@ -42,8 +42,8 @@ class Certificate:
     """
 
     kkt: float = np.nan
-    angle: float = np.nan
-    ratio: float = np.nan
+    gradient_angle: float = np.nan
+    gradient_ratio: float = np.nan
     missing: str = ""
     violated: str = ""
     seconds: float = 0.0
@@ -56,22 +56,13 @@ class Certificate:
             return f"no exact gradient to judge the design by: {self.missing}"
         kept = " of a design that does not keep all constraints" if self.violated else ""
         parts = [f"optimality check with the exact gradient{kept}: residual {self.kkt:.2g}"]
-        if np.isfinite(self.angle):
-            parts.append(f"the frozen-load gradient differs from it by {self.angle:.3g} degrees")
+        if np.isfinite(angle := self.gradient_angle):
+            parts.append(f"the frozen-load gradient differs from it by {angle:.3g} degrees")
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
         """Return its entry of summary.json."""
-        return {
-            "kkt": self.kkt,
-            "gradient_angle": self.angle,
-            "gradient_ratio": self.ratio,
-            "feasible": not self.violated,
-            "missing": self.missing,
-            "stationary": self.stationary,
-            "seconds": self.seconds,
-            "sentence": self.sentence,
-        }
+        return asdict(self) | {"feasible": not self.violated, "sentence": self.sentence}
 
 
 def judge(

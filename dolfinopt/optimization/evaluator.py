@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from copy import copy
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.arm import Patterns, PhysicalDesign
+from dolfinopt.arms.arm import Arm, Patterns, PhysicalDesign
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.collocation import Solution
+from dolfinopt.dynamics.work import Work, counted
+from dolfinopt.optimization.measured import NEWTON_ITERATIONS
 from dolfinopt.optimization.problem import EvaluatedDesign, binds, variants_of
 from dolfinopt.optimization.projection import Projection
 from dolfinopt.optimization.variables import Variables
@@ -27,10 +29,6 @@ from dolfinopt.responses.evaluation import (
 from dolfinopt.responses.response import Analysis, CellGradient
 from dolfinopt.scene.law_variables import LAW, with_law
 from dolfinopt.scene.load import Scene
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
-
 
 # Solutions, and eigenvectors of every arm.
 Start = tuple[tuple[Solution, ...], dict[int, list[np.ndarray]]]
@@ -108,6 +106,11 @@ class Evaluator:
         """Add the gradients to designs that were `tried` last (collective)."""
         *others, last = designs
         return [*others, self.differentiated(last.physical, last.evaluation)]
+
+    def bounded(self, designs: int = 1) -> AbstractContextManager[Work]:
+        """Bound the work of so many designs by that of the last motion; without one it has none."""
+        steps = sum(len(solution.a) for solution in self.solutions)  # none off the root
+        return counted(NEWTON_ITERATIONS * designs * steps if steps else np.inf)
 
     def undo(self) -> None:
         """Set out from where the last evaluation did (collective)."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.arms.arm import Arm
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.errors import InputError
@@ -20,9 +20,6 @@ from dolfinopt.responses.motion import MotionResponse, motions_of
 from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
 
 # Of the design variable, from one to the next a quarter as long: remainders of second order fall
 # by 16.

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from dolfinopt.dynamics.work import counted
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.measured import (
@@ -16,7 +15,6 @@ from dolfinopt.optimization.measured import (
     DECIMALS,
     LEAST_REACH,
     LIMITS_MEMORY,
-    NEWTON_ITERATIONS,
     REACH_GROWTH,
     SHORTER_REACH,
     STEP_ATTEMPTS,
@@ -180,10 +178,8 @@ class Iterate:
         """Evaluate a step (collective); None where it leads nowhere, which is taken back."""
         self.stuck = ""
         self.change = float(np.abs(new - self.x).max())
-        steps = sum(len(solution.a) for solution in self.evaluator.solutions)  # none off the root
-        most = NEWTON_ITERATIONS * steps * len(self.designs)
         try:
-            with counted(most if steps else np.inf):
+            with self.evaluator.bounded(len(self.designs)):
                 designs = self.evaluator.tried(new)
         except ConvergenceError as error:  # on all ranks
             self.stuck = str(error)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import accumulate
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.arms.arm import Arm
 from dolfinopt.parallel import Partition, gather_cells, on_all_ranks
 from dolfinopt.scene.law_variables import LAW, law_bounds, law_values
 from dolfinopt.scene.load import Scene
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
 
 
 class Variables:

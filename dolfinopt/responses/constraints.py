@@ -136,9 +136,7 @@ def tightest(limits: Sequence[Limit]) -> str:
     worst = max(asked, key=lambda item: item.excess)
     if worst.met:
         return "limits met"
-    percent = 100.0 * worst.excess
-    share = f"{percent:.0f}" if percent >= 10.0 else f"{percent:.2g}"
-    return f"{worst.words} {share} % {'below' if worst.least else 'over'} limit"
+    return f"{worst.words} {100.0 * worst.excess:.3g} % {'below' if worst.least else 'over'} limit"
 
 
 def summary_of(limits: Sequence[Limit]) -> Mapping[str, Any]:

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.arm import chain_of, stiffening_of
+from dolfinopt.arms.arm import Arm, chain_of, stiffening_of
 from dolfinopt.dynamics.build import Trajectory, largest_stiffness_change, simulate
 from dolfinopt.dynamics.collocation import Solution
 from dolfinopt.errors import InputError
@@ -34,9 +33,6 @@ from dolfinopt.responses.response import (
     sums,
 )
 from dolfinopt.scene.load import Scene, pose_scenarios
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
 
 
 @dataclass(frozen=True)

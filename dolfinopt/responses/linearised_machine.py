@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dolfinopt.arms.arm import chain_of
+from dolfinopt.arms.arm import Arm, chain_of
 from dolfinopt.dynamics.build import check_instant, simulate, state_space
 from dolfinopt.dynamics.state_space import StateSpace
 from dolfinopt.errors import ConvergenceError
@@ -22,9 +21,6 @@ from dolfinopt.profiling import Profile
 from dolfinopt.responses.measured import COORDINATES_LIMIT, POLE_ERROR
 from dolfinopt.responses.order_selection import RICHER_METHOD, Reductions, fewest
 from dolfinopt.scene.load import Scene
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
 
 
 def linearised_machine(

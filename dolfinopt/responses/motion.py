@@ -520,8 +520,7 @@ class PeakForce(PMean, DriveResponse):
     def restricted(self, limits: Sequence[float | None]) -> tuple[Response, tuple[float, ...]]:
         """Return the response of those drives that have a limit, and these limits."""
         drives = tuple(k for k, limit in enumerate(limits) if limit is not None)
-        kept = tuple(limit for limit in limits if limit is not None)
-        return PeakForce(self.options, self.limited, drives), kept
+        return PeakForce(self.options, self.limited, drives), super().restricted(limits)[1]
 
     def parts(self, scene: Scene) -> Sequence[tuple[str, MotionResponse]]:
         """Return one response for every drive that counts, by the name of its coordinate."""

@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from sys import maxsize
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.arms.arm import Arm
 from dolfinopt.arms.design_state import options
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.measured import RESTING_GROUP_SHARE
@@ -26,10 +26,6 @@ from dolfinopt.responses.evaluation import decide_stiffening, simulated_together
 from dolfinopt.responses.measured import COORDINATES_LIMIT, RICHER_COORDINATES, TIME_ERROR_SHARE
 from dolfinopt.responses.response import factors
 from dolfinopt.scene.load import Scene, pose_scenarios
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
-
 
 RICHER_METHOD = "craig-bampton"  # of what motions and poles are compared with
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from dolfinopt.arms.arm import Arm
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.fem.stress import places_of, stress_operator
 from dolfinopt.fem.tensors import stress_points
 from dolfinopt.parallel import Partition, gather_arms, gather_cells, on_root, together
+from dolfinopt.profiling import Profile
 from dolfinopt.responses.stress import (
     ArmLoads,
     Screened,
@@ -19,12 +22,7 @@ from dolfinopt.responses.stress import (
     maxima,
     screen,
 )
-
-if TYPE_CHECKING:
-    from dolfinopt.arms.arm import Arm
-    from dolfinopt.dynamics.build import Trajectory
-    from dolfinopt.profiling import Profile
-    from dolfinopt.scene.load import Scene
+from dolfinopt.scene.load import Scene
 
 
 @dataclass(frozen=True)
@@ -43,12 +41,7 @@ class Peak:
 
     def to_dict(self, arm: str) -> dict[str, Any]:
         """Return its entry of summary.json."""
-        return {
-            "value": self.value,
-            "arm": arm,
-            "place": list(self.place),
-            "instant": self.instant,
-        }
+        return asdict(self) | {"arm": arm, "place": list(self.place)}
 
 
 @dataclass(frozen=True, eq=False)

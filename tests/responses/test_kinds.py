@@ -271,4 +271,4 @@ def test_timoshenkos_cantilever(dim, tmp_path):
     assert (place.value, turn.value) == pytest.approx((u, theta), rel=5e-3)
     assert (place.name, place.unit) == ("stiffness_link_case1", "m")
     assert (turn.name, turn.unit) == ("stiffness_link_case1_rotation", "rad")
-    assert not turn.met and "stiffness of link_case1_rotation" in turn.sentence
+    assert not turn.met and "stiffness of link_case1_rotation" in turn.usage
