@@ -8,7 +8,8 @@ The one rule of aggregation: an extreme over instants, modes, load cases or scen
 value, which reports show and limits hold for, and a smooth one, its p-mean or p-norm with
 `objective.exponent`, which is differentiated. A constraint is the true value over its limit less
 1; its gradient is that of smooth value / smooth limit, where the smooth limit is the limit times
-smooth / true value of the same design, held: a scale that follows the design and has no memory.
+smooth / true value of the same design, held. The optimiser's scale remembers earlier designs, see
+`optimization.iterate`.
 Source: Le, Norato, Bruns, Ha & Tortorelli (2010), doi:10.1007/s00158-009-0440-y.
 """
 
