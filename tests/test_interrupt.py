@@ -133,7 +133,7 @@ def test_an_interrupted_optimisation_says_how_to_go_on(tmp_path, monkeypatch, op
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module.loop, "run", interrupted)
+    monkeypatch.setattr(module.Optimization, "go", interrupted)
     words = ["optimize", str(paper_scene()), "--set", "arms.cells=[12,3]", "--out", str(tmp_path)]
     words += ["--set", "design.filter_radius=0.2", *filter(None, [option])]
     with pytest.raises(click.Abort) as caught:

@@ -53,6 +53,11 @@ FEWEST = 6  # points of an arc: a circle goes through any three
 ANOTHER = 0.05
 
 
+def nine_digits(size: float) -> float:
+    """Return a size that is the same on every processor: meshers choose by the last digits."""
+    return float(f"{size:.9g}")
+
+
 @dataclass(frozen=True, eq=False)
 class Edge:
     """A curve of a boundary and what it belongs to: "inboard", "outboard" or ""."""
@@ -453,7 +458,8 @@ class Domain(Filled):
     @property
     def cell(self) -> float:
         """Size of a cell: the root of the median area, m."""
-        return float(np.sqrt(np.median(self.area)) * (1.0 if self.corners.shape[1] == 4 else 1.5))
+        factor = 1.0 if self.corners.shape[1] == 4 else 1.5
+        return nine_digits(factor * np.sqrt(np.median(self.area)))
 
     @property
     def edges(self) -> list[Edge]:

@@ -23,7 +23,7 @@ from dolfinopt.disk import write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.gmsh_session import TRIANGLE, gmsh_on_root
 from dolfinopt.mesh.solid_cells import Tetrahedra, msh_bytes, points_by_tag, tetrahedra_of
-from dolfinopt.part.domain import INBOARD, OUTBOARD, ROUNDING, SolidDomain
+from dolfinopt.part.domain import INBOARD, OUTBOARD, ROUNDING, SolidDomain, nine_digits
 from dolfinopt.part.plane.curves import (
     HALVINGS,
     MM,
@@ -413,7 +413,7 @@ def mesh_size(part: SolidPart) -> float:
     cube = float(np.median(part.domain.sizes)) ** (1.0 / 3.0)
     across = float(np.ptp(part.surface.points, axis=0)[1:].min())
     least = (IN_CUBE * part.volume / MOST) ** (1.0 / 3.0)
-    return float(max(min(cube, across / ACROSS), least))
+    return nine_digits(max(min(cube, across / ACROSS), least))
 
 
 def solid_mesh(part: SolidPart, size: float) -> Tetrahedra:

@@ -220,8 +220,9 @@ def rigid_gradient(state: DesignState, by_rigid: ShapeIntegrals, by: By = by_des
     """
     points = state.elastic.points
     partners = mass_partners(points, np.empty((*points.shape, 0)), by_rigid)
-    mass = partners.left, partners.right
-    return by(state, Products(mass=(mass,), places=partners.by_points))
+    # Arms that are not outboard are not felt.
+    mass = ((partners.left, partners.right),) * bool(partners.left.any())
+    return by(state, Products(mass=mass, places=partners.by_points))
 
 
 @dataclass(frozen=True, eq=False)
