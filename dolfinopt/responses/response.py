@@ -100,7 +100,7 @@ class Measured:
     @property
     def total(self) -> float:
         """Sum of the smooth values: the objective."""
-        return float(np.sum(self.smooth))
+        return sum(self.smooth)
 
 
 class Response(ABC):
