@@ -4,4 +4,4 @@ __version__ = "0.1.0"
 # Raise it with every change that alters results: of the finite elements, reductions, simulation,
 # gradients or optimiser, beyond rounding; and with every change of the files that are kept of
 # them.
-NUMERICS = 11
+NUMERICS = 12
