@@ -52,8 +52,7 @@ if TYPE_CHECKING:
 
 # -- inertia of rigid bodies in space, as URDF states it -----------------------------------------
 
-Product = Annotated[float, Field(ge=-1e9, le=1e9)]
-Tensor = Six[Product]  # xx, yy, zz, xy, xz, yz
+Tensor = Six[Annotated[float, Field(ge=-1e9, le=1e9)]]  # xx, yy, zz, xy, xz, yz
 # By how much, over the largest, rounded moments may miss the triangle inequality.
 ROUNDED = 1e-6
 
@@ -97,7 +96,6 @@ SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 SECTIONS = ("box", "tube")
 SectionOrFile = Annotated[str, NAMES_FILE, Field(json_schema_extra={"examples": list(SECTIONS)})]
-WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
 WALL_KEYS = ("wall", "min_wall", "max_wall")
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
@@ -167,9 +165,9 @@ class Arm(Drive):
     passive: Extent | None = None
     symmetric: bool | Literal["z", "yz", "extruded", "y-extruded"] = False
     hollow: bool | SectionOrFile = False
-    wall: WallThickness | None = None
-    min_wall: WallThickness | None = None
-    max_wall: WallThickness | None = None
+    wall: Length | None = None
+    min_wall: Length | None = None
+    max_wall: Length | None = None
     design: str | None = None
     rigid: bool = False
     mass: Inertia | None = None

@@ -290,11 +290,7 @@ class Optimizer(Table):
 # -- [part]: what `dolfinopt part` makes of a result, unless its options say otherwise ----------
 
 
-MAX_STARTS = 100
-
-
 STEPS = 80  # of the curves, unless stated
-OptimizerSteps = Annotated[int, Field(ge=1, le=MAX_ITERATIONS)]
 
 
 class Part(Table):
@@ -303,8 +299,8 @@ class Part(Table):
     tool_radius: Extent | None = None
     tolerance: Length | None = None
     minimum_member: Length | None = None
-    optimize: bool | OptimizerSteps = False
-    starts: int = Field(default=0, ge=0, le=MAX_STARTS)
+    optimize: bool | Annotated[int, Field(ge=1, le=MAX_ITERATIONS)] = False
+    starts: int = Field(default=0, ge=0, le=100)
 
     @property
     def iterations(self) -> int:

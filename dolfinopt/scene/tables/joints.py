@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 
 INBOARD, OUTBOARD = "inboard", "outboard"
 Point = Three[Position]
-Vector = Three[float]
 Components = TypeVar("Components", bound=tuple[float, ...])
 
 
@@ -39,9 +38,6 @@ def check_direction(axis: Components) -> Components:
     if math.hypot(*axis) < 1e-9:
         raise Refusal("expected a direction, not of length zero")
     return axis
-
-
-Axis = Annotated[Vector, AfterValidator(check_direction)]
 
 
 def _check_name(name: str) -> str:
@@ -57,7 +53,7 @@ class Interface(Table):
     name: Annotated[str, AfterValidator(_check_name)]
     point: Point
     radius: Length | None = None
-    axis: Axis | None = None
+    axis: Annotated[Three[float], AfterValidator(check_direction)] | None = None
 
     @property
     def is_end(self) -> str:

@@ -174,7 +174,6 @@ def _check_machine(scene: Scene) -> None:
 # -- `[[closures]]`: joints that close loops between arms, or with the ground ---------------------
 
 Line = tuple[Component, Component]
-ClosureKind = Literal["ball", "pin", "slider", "universal", "rod"]
 # Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
 OF_THE_END = ("deviation", "settling")
 # What is positive of every equation's force and moment, in the joint's frame; in the plane and in
@@ -194,7 +193,7 @@ class Closures(Table):
     """A joint between an arm's interface and another one or the ground that closes a loop."""
 
     name: Annotated[str, AfterValidator(check_joint_name)]
-    kind: ClosureKind
+    kind: Literal["ball", "pin", "slider", "universal", "rod"]
     between: tuple[str, str]
     point: TwoOrThree[Position] = (0.0, 0.0, 0.0)
     rpy: Three[Angle] = (0.0, 0.0, 0.0)
@@ -354,13 +353,11 @@ class Closures(Table):
 
 # -- `[control]` ---------------------------------------------------------------------------------
 
-Known = Literal["rigid", "elastic", "tip", "none"]
-
 
 class Control(Table):
     """Feed-forward and feedback that drive the rigid coordinates instead of prescribing them."""
 
-    feed_forward: Known = "rigid"
+    feed_forward: Literal["rigid", "elastic", "tip", "none"] = "rigid"
     stiffness: tuple[Stiffness, ...]
     damping: tuple[Stiffness, ...]
     limits: tuple[DriveForce, ...] | None = None
@@ -465,8 +462,6 @@ class Payload(Table):
 
 ForceComponent = Annotated[float, Field(ge=-1e12, le=1e12)]  # N, N m
 Vector = TwoOrThree[ForceComponent]
-GivenMoment = ForceComponent | Three[ForceComponent]
-ForceFrame = Literal["world", "arm"]
 # Columns of a table besides t, by the machine's dimension.
 FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 
@@ -477,10 +472,10 @@ class Force(Table):
     name: Annotated[str, AfterValidator(check_joint_name)] | None = None
     arm: str
     force: Vector | None = None
-    moment: GivenMoment | None = None
+    moment: ForceComponent | Three[ForceComponent] | None = None
     table: FileName | None = None
     factor: float = Field(default=1.0, ge=-1e12, le=1e12)
-    frame: ForceFrame = "world"
+    frame: Literal["world", "arm"] = "world"
     feed_forward: bool = True
 
     def check_table(self) -> None:

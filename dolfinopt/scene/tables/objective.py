@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 else:  # the words of the responses that are declared
     ObjectiveKind = Literal[tuple(objective_kinds())]
 GradientKind = Literal["esl", "exact"]
-Attached = Literal["rigid-body", "point-mass", "none"]
-Combination = Literal["sum", "worst"]
 MANY_CASES = 1000  # load cases that a motion may have however short it is
 Load = Three[float]  # F_x N, F_y N, moment N m
 SpatialLoad = Six[float]  # force N, moment N m
@@ -54,9 +52,7 @@ SPATIAL_LOADS: tuple[SpatialLoad, ...] = (
     (0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
     (0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
 )
-ModeCount = Annotated[int, Field(ge=1, le=50)]
 TRACKED_AMONG = 6  # lowest modes: what becomes of the first one ends among them
-Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 
 
 class Objective(Table):
@@ -69,12 +65,12 @@ class Objective(Table):
     exponent: float = Field(default=20.0, ge=2, le=200)
     stress_exponent: float = Field(default=4.0, ge=2, le=100)
     stress_margin: Extent = 0.0
-    scenarios: Combination = "sum"
+    scenarios: Literal["sum", "worst"] = "sum"
     loads: tuple[Load | SpatialLoad, ...] = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    effort_weights: tuple[Weight, ...] | None = None
-    attached: Attached = "rigid-body"
+    effort_weights: tuple[Annotated[float, Field(ge=0, le=1e9)], ...] | None = None
+    attached: Literal["rigid-body", "point-mass", "none"] = "rigid-body"
     elbow_angle: Angle | None = None
-    modes: ModeCount | Literal["first"] = 3
+    modes: Annotated[int, Field(ge=1, le=50)] | Literal["first"] = 3
 
     @property
     def follow(self) -> bool:
