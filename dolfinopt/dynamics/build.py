@@ -183,7 +183,7 @@ def _drives(scene: Scene) -> Drives:
     dependent[passive_coordinates(scene)] = free[passive_coordinates(scene)] = True
     soft = soft_joints(scene)
     for k, item in soft.items():
-        free[k], stiffness[k], damping[k] = True, item.stiffness, item.damping
+        free[k], stiffness[k], damping[k] = True, item.gear_stiffness, item.gear_damping
     for k, rod in enumerate(scene.rods, len(scene.movable)):
         if rod.is_spring:
             free[k], stiffness[k], damping[k] = True, rod.stiffness, rod.damping
@@ -199,8 +199,8 @@ def _drives(scene: Scene) -> Drives:
     friction = friction_of(scene, soft=True)
     springs = Springs(
         joints=np.searchsorted(rows, np.array(motors, dtype=int)),
-        stiffness=np.array([soft[k].stiffness for k in motors]),
-        damping=np.array([soft[k].damping for k in motors]),
+        stiffness=np.array([soft[k].gear_stiffness for k in motors]),
+        damping=np.array([soft[k].gear_damping for k in motors]),
         friction=friction.of(np.array(motors, dtype=int)),
     )
     table = _table_of_forces(scene)

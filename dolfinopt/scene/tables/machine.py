@@ -33,7 +33,7 @@ from dolfinopt.scene.tables.joints import (
     check_direction,
     check_site,
     check_used,
-    joint_parts,
+    joint_drives,
     place_of,
     site_of,
 )
@@ -365,9 +365,8 @@ class Control(Table):
 
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse gains and limits that are not one for every driven coordinate."""
-        if self.feed_forward == "elastic" and not any(
-            part.stiffness for part in joint_parts(scene)
-        ):
+        soft = any(drive.gear_stiffness for drive in joint_drives(scene))
+        if self.feed_forward == "elastic" and not soft:
             raise Refusal(
                 'expected "rigid": no joint has a gear that gives way; state gear_stiffness',
                 ".feed_forward",
