@@ -127,8 +127,7 @@ class Design(Table):
         )
         thin, wide = min(self.least_widths), max(self.least_widths)
         if wide > max(ratio, 1.0) * thin * (1.0 + 1e-9):
-            wider = "minimum_member" if self.minimum_member > self.minimum_gap else "minimum_gap"
-            other = "minimum_gap" if wider == "minimum_member" else "minimum_member"
+            other, wider = sorted(("minimum_gap", "minimum_member"), key=vars(self).__getitem__)
             raise Refusal(
                 f"expected at most {ratio * thin:.4g} [m], {ratio:.3g} times {other} = {thin}, "
                 f"with erosion = {self.erosion}; lower erosion or widen the other",
@@ -222,10 +221,11 @@ class Region(Table):
     def check_table(self) -> None:
         if (self.box is None) == (self.circle is None):
             raise Refusal(
-                "expected one of box = [x0, y0, x1, y1] and circle = [x, y, radius] "
-                f"{'beside' if self.box is None else 'alone, not both, beside'} kind",
+                "expected one of box = [x0, y0, x1, y1] and circle = [x, y, radius] beside kind, "
+                "not both",
                 "kind",
-                *([] if self.box is None else ["box", "circle"]),
+                "box",
+                "circle",
             )
         if self.box is not None and not (self.box[0] < self.box[2] and self.box[1] < self.box[3]):
             raise Refusal("expected [x0, y0, x1, y1] with x0 < x1 and y0 < y1 [m]", "box")

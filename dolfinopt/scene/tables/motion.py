@@ -341,13 +341,9 @@ class Reduction(Table):
         for i, arm in enumerate(scene.arms):
             least = self.fewest_of(arm)
             if arm.flexible and 0 < self.count < least and arm.is_solid:
-                has = "interface has six coordinates"
-                if arm.further_interfaces:
-                    has = (
-                        f"interfaces, {1 + len(arm.further_interfaces)}, have six coordinates each"
-                    )
                 raise Refusal(
-                    f"expected an integer >= {least} with a solid arm: its outboard {has}",
+                    f"expected an integer >= {least} with a solid arm: six coordinates for each of "
+                    f"its outboard interfaces, {1 + len(arm.further_interfaces)}",
                     "reduction.coordinates",
                     f"arms.{i}.cells",
                 )
