@@ -53,13 +53,15 @@ def init(name: Path, template: str, older: str | None) -> None:
     check_new(path.with_name(name) for name in texts)
     write_files(path.parent, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n", **texts})
     written = ", ".join(os.fspath(path.with_name(name)) for name in texts)
-    click.echo(f"{written}: edit the values that differ for your machine")
-    click.echo(f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)")
-    if template == "step":
-        click.echo(f"put your STEP file beside it, as {path.with_name('arm.step')}")
-    click.echo("then:")
-    click.echo(f"  dolfinopt simulate {path}    # what the machine does with half the material")
-    click.echo(f"  dolfinopt optimize {path}")
+    told = [
+        f"{written}: edit the values that differ for your machine",
+        f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)",
+        *[f"put your STEP file beside it, as {path.with_name('arm.step')}"] * (template == "step"),
+        "then:",
+        f"  dolfinopt simulate {path}    # what the machine does with half the material",
+        f"  dolfinopt optimize {path}",
+    ]
+    click.echo("\n".join(told))
 
 
 # -- `dolfinopt keys` ----------------------------------------------------------------------------
@@ -79,10 +81,9 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
     result = [info for info in known if _fits(info, pattern)]
     materials = _materials(pattern, result)
     if not result and not materials:
-        near = difflib.get_close_matches(str(pattern), [info.key for info in known], 3)
-        near += difflib.get_close_matches(
-            str(pattern), sorted({part for info in known for part in info.key.split(".")}), 3
-        )
+        paths = [info.key for info in known]
+        parts = sorted({part for path in paths for part in path.split(".")})
+        near = [x for x in (paths, parts) for x in difflib.get_close_matches(str(pattern), x, 3)]
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(f"{pattern}: no such key; {hint}dolfinopt keys lists all of them")
     click.echo("\n".join([*map(_explained, result), *materials]))

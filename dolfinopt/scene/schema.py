@@ -31,6 +31,8 @@ from dolfinopt.scene.tables.machine import (
     Force,
     Joint,
     Payload,
+    check_machine,
+    check_tree,
 )
 from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction, Simulation
@@ -357,6 +359,9 @@ class Scene(Table):
             for i, table in enumerate(tables):
                 if isinstance(table, Table):
                     table.check_at(self, (key, i) if tables is value else (key,))
+            if key == "joints" and self.is_spatial:
+                check_tree(self)
+                check_machine(self)
 
 
 # Keys that name a file, as (table, key); a scene holds their absolute paths.

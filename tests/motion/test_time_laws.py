@@ -253,8 +253,8 @@ def test_bad_table(tmp_path, text, words):
 
 def test_file_that_cannot_be_read(tmp_path):
     for file, reason in (
-        (str(tmp_path), "is a directory"),
-        (str(tmp_path / "absent.csv"), "no such file"),
+        (str(tmp_path), "Is a directory"),
+        (str(tmp_path / "absent.csv"), "No such file"),
     ):
         refusal(lambda: read_table(file, ("x", "y")), reason, "a table (CSV)")  # noqa: B023
     with pytest.raises(InputError, match="not a file name"):

@@ -207,14 +207,14 @@ class Arm(Drive):
             )
 
     def _check_thickness(self) -> None:
-        if isinstance(self.symmetric, str) and not self.is_solid:
-            raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", "symmetric")
-        if self.extruded and self.cells is None:
-            raise Refusal("expected only with cells = [nx, ny, nz]", "symmetric", "mesh")
+        plane = isinstance(self.symmetric, str) and not self.is_solid
+        expected = "expected only with a solid arm, cells = [nx, ny, nz]"
+        if plane or (self.extruded and self.cells is None):
+            raise Refusal(expected, "symmetric", "mesh")
         for number, region in enumerate(self.regions):
             key = f"regions.{number}.depth"
             if region.depth is not None and not self.is_solid:
-                raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", key)
+                raise Refusal(expected, key)
             if region.depth is not None and self.extruded:
                 raise Refusal(
                     f'expected none with symmetric = "{self.symmetric}": the design is the same '
@@ -233,12 +233,7 @@ class Arm(Drive):
                 "hollow",
                 *(["mesh"] if self.mesh is not None else []),
             )
-        if self.wall is None:
-            raise Refusal(
-                "expected a number > 0 [m], the wall's initial thickness, with hollow = true",
-                "wall",
-                "hollow",
-            )
+        self.need("wall", "hollow")
         if self.extruded:
             raise Refusal("expected another value with hollow = true", "symmetric", "hollow")
         for key in ("regions", "interfaces"):

@@ -239,6 +239,13 @@ class Table(BaseModel):
             Refusal: they do not.
         """
 
+    def need(self, key: str, choice: str) -> None:
+        """Raise if a key has no value that another one's asks for."""
+        if getattr(self, key, None) is None:
+            meaning = type(self).model_fields[key].description
+            reason = f"expected a value with {choice} = {shown(getattr(self, choice))}"
+            raise Refusal(f"{reason}: {meaning}", key, choice)
+
     def refuse_stated(self, key: str, reason: str, *others: str) -> None:
         """Raise if a key, of any path, has not its default; `reason` goes on after it."""
         name = key.rpartition(".")[2]

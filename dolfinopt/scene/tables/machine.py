@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import takewhile
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, field_validator
@@ -85,45 +84,35 @@ class Joint(Drive):
         if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
             raise Refusal("expected the least first, then the largest", "position_limits")
         super().check_table()
-        if self.axis is None and self.moves:
-            raise Refusal(
-                f"expected an array of three numbers with a {self.type} joint", "axis", "type"
-            )
+        if self.moves:
+            self.need("axis", "type")
 
     def check_in_scene(self, scene: Scene) -> None:
-        """Refuse names that are unknown; with the last joint, all that joints rule out.
-
-        Raises:
-            Refusal: its keys are paths from the scene.
-        """
-        before = list(takewhile(lambda joint: joint is not self, scene.joints))
+        """Refuse names that are unknown."""
         names = [arm.name for arm in scene.arms]
         if self.child not in names:
             allowed = " | ".join(map(shown, names))
             raise Refusal(f"expected the name of an arm: {allowed}", ".child")
         check_site(scene, self.parent, ".parent", (GROUND,))
-        for other in before:
-            if other.child == self.child:
-                raise Refusal(
-                    f"expected an arm that no other joint holds: {self.child} hangs on "
-                    f"{other.name}; a joint that closes a loop is one of [[closures]]",
-                    ".child",
-                )
-        if len(before) == len(scene.joints) - 1:
-            _check_tree(scene)
-            _check_machine(scene)
 
 
-def _check_tree(scene: Scene) -> None:
-    """Refuse arms without a joint, joints that do not lead to the ground or that nothing moves."""
-    parents = {joint.child: joint.parent_arm for joint in scene.joints}
+def check_tree(scene: Scene) -> None:
+    """Refuse arms not held by one joint, joints off the ground or that nothing moves."""
+    holding: dict[str, Joint] = {}
+    for i, joint in enumerate(scene.joints):
+        if (other := holding.setdefault(joint.child, joint)) is not joint:
+            raise Refusal(
+                f"expected an arm that no other joint holds: {joint.child} hangs on "
+                f"{other.name}; a joint that closes a loop is one of [[closures]]",
+                f"joints.{i}.child",
+            )
     for k, arm in enumerate(scene.arms):
         if arm.name == GROUND:
             raise Refusal(
                 'expected another name: with [[joints]] "ground" is what the machine stands on',
                 f"arms.{k}.name",
             )
-        if arm.name not in parents:
+        if arm.name not in holding:
             raise Refusal(
                 "expected one of [[joints]] whose child it is", f"arms.{k}.name", "joints"
             )
@@ -134,7 +123,7 @@ def _check_tree(scene: Scene) -> None:
         passed, above = [joint.child], joint.parent_arm
         while above != GROUND and above not in passed:
             passed.append(above)
-            above = parents[above]
+            above = holding[above].parent_arm
         if above != GROUND:
             raise Refusal(
                 f"expected a tree that stands on the ground: from {joint.child} its parents lead "
@@ -145,7 +134,7 @@ def _check_tree(scene: Scene) -> None:
         raise Refusal('expected a "revolute" or "prismatic" joint: nothing moves', "joints.0.type")
 
 
-def _check_machine(scene: Scene) -> None:
+def check_machine(scene: Scene) -> None:
     """Refuse what only a machine in the plane has, or what has no equations in space yet."""
     motion = scene.motion
     if motion.path not in PATHS:
@@ -226,9 +215,7 @@ class Closures(Table):
     def check_table(self) -> None:
         needed = {"slider": ("axis",), "universal": ("axis", "cross_axis")}
         for key in needed.get(self.kind, ()):
-            if getattr(self, key) is None:
-                reason = f"expected an array of three numbers with a {self.kind}"
-                raise Refusal(reason, key, "kind")
+            self.need(key, "kind")
         if self.kind != "universal":
             return
         assert self.axis is not None and self.cross_axis is not None

@@ -125,9 +125,8 @@ class Material(Table):
             given, optional = getattr(self, key, None) is not None, key not in OF_ALL
             if given and optional and key not in self.law.used:
                 raise Refusal(f"expected none {kind}", key, "kind")
-            if not given and (not optional or key in self.law.keys):
-                meaning = type(self).model_fields[key].description
-                raise Refusal(f"expected a value {kind}: {meaning}", key, "kind")
+            if not optional or key in self.law.keys:
+                self.need(key, "kind")
         if self.kind == "orthotropic":
             check_orthotropic(self, dim)
             return

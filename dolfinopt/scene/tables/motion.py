@@ -68,13 +68,8 @@ class Motion(Table):
     gravity: TwoOrThree[Acceleration] = (0.0, 0.0)
 
     def check_table(self) -> None:
-        tabulated = self.path in ("points", "joints")
-        if tabulated and self.file is None:
-            raise Refusal(
-                f'expected the path of a table (CSV) with motion.path = "{self.path}"',
-                "file",
-                "path",
-            )
+        if self.path in ("points", "joints"):
+            self.need("file", "path")
         if self.path == "line" and self.start == self.end:
             raise Refusal("expected another point than motion.start", "end", "start")
         if self.path == "rotation" and not self.is_fixed:
