@@ -223,13 +223,8 @@ def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
 
 
 def write_sid(path: Path, data: StandardInputData) -> None:
-    """Write the text file; `read_sid` gets the same bits back."""
-    write_text(path, sid_text(data))
-
-
-def sid_text(data: StandardInputData) -> str:
-    """Return the content of the text file, numbers with 17 digits and Fortran's exponent."""
-    return filled(
+    """Write the text file, numbers with 17 digits; `read_sid` gets the same bits back."""
+    text = filled(
         "body.sid.jinja",
         {"number": _number, "written": _written},
         data=data,
@@ -237,6 +232,7 @@ def sid_text(data: StandardInputData) -> str:
         of_node=NODE,
         of_body=BODY,
     )
+    write_text(path, text)
 
 
 def _number(value: float) -> str:

@@ -158,10 +158,9 @@ class Design(Table):
 
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse what the arms, their cells and their solid ends cannot meet."""
-        if not scene.cell_counts:  # nothing to design
-            return
-        self._check_hollow(scene)
-        self._check_member_width(scene)
+        if scene.cell_counts:  # there is something to design
+            self._check_hollow(scene)
+            self._check_member_width(scene)
 
     def _check_hollow(self, scene: Scene) -> None:
         """Refuse what walls have no use for."""

@@ -227,7 +227,10 @@ class Closures(Table):
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
         if self.name.casefold() in [joint.name.casefold() for joint in scene.joints]:
             raise Refusal("expected a name that no joint or other closure has", ".name")
-        self._check_ends(scene)
+        check_site(scene, self.between[0], ".between")
+        check_site(scene, self.between[1], ".between", (GROUND,))
+        if site_of(self.between[0])[0] == site_of(self.between[1])[0]:
+            raise Refusal("expected interfaces of two arms", ".between")
         if scene.is_spatial:
             self._check_in_space(scene)
         else:
@@ -330,12 +333,6 @@ class Closures(Table):
                 place,
                 ".kind",
             )
-
-    def _check_ends(self, scene: Scene) -> None:
-        check_site(scene, self.between[0], ".between")
-        check_site(scene, self.between[1], ".between", (GROUND,))
-        if site_of(self.between[0])[0] == site_of(self.between[1])[0]:
-            raise Refusal("expected interfaces of two arms", ".between")
 
 
 # -- `[control]` ---------------------------------------------------------------------------------

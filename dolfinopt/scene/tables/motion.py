@@ -285,18 +285,13 @@ class Reduction(Table):
         """Frequency band whose responses "balanced" weights, Hz."""
         return (self.frequencies[0], self.frequencies[-1]) if self.frequencies else BAND
 
-    def _check_frequencies(self) -> None:
-        given = self.frequencies
-        if given is None:
-            return
-        if self.method == "krylov" and (not given or len(set(given)) < len(given)):
-            raise Refusal("expected at least one number >= 0, none of them twice", "frequencies")
-        if self.method == "balanced" and (len(given) != 2 or given[0] >= given[1]):
-            raise Refusal("expected two frequencies, the lower one first", "frequencies")
-
     def check_table(self) -> None:
         """Refuse frequencies and numbers of coordinates that the method cannot have."""
-        self._check_frequencies()
+        given = self.frequencies
+        if given and self.method == "balanced" and (len(given) != 2 or given[0] >= given[1]):
+            raise Refusal("expected two frequencies, the lower one first", "frequencies")
+        if given is not None and (not given or len(set(given)) < len(given)):
+            raise Refusal("expected at least one number >= 0, none of them twice", "frequencies")
         if not self.count or self.count >= self.fewest:
             return
         what = "interface loads at each of reduction.frequencies"
