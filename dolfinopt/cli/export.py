@@ -67,7 +67,12 @@ def export(
     at = _instant(last) if kind == "state-space" else 0.0
     if is_run and design is not None:
         raise InputError("--design: expected none with the folder of a run, which has its own")
-    loaded = _machine(world, scene, overrides, is_run or kind == "robot")
+    if not is_run and kind != "robot":
+        loaded = load(world, scene, overrides)
+    elif overrides:
+        raise InputError("--set: expected none with the folder of a run, whose scene it is")
+    else:
+        loaded = on_root(world, scene_of, scene)
     if kind == "robot":
         _export_robot(world, loaded, scene, out, overwrite, None if last is None else Path(last))
         return
@@ -91,16 +96,6 @@ def _instant(word: str | None) -> float:
         ) from None
 
 
-def _machine(world: MPI.Comm, source: Path, overrides: tuple[str, ...], is_run: bool) -> Scene:
-    """Return the scene of a file or of a run's folder (collective)."""
-    if not is_run:
-        return load(world, source, overrides)
-    if overrides:
-        raise InputError("--set: expected none with the folder of a run, whose scene it is")
-    scene: Scene = on_root(world, scene_of, source)
-    return scene
-
-
 # -- bodies --------------------------------------------------------------------------------------
 
 KINDS = (".sid", ".sid.npz", ".fem")
@@ -113,7 +108,7 @@ def _export_bodies(
     names = [f"{arm.name}{kind}" for arm in scene.arms for kind in KINDS]
     claim(world, folder, overwrite, names, scene=scene)
     place = arms_with_design(world, scene, design, Profile())
-    _, partition, arms, x_phys = place
+    scene, partition, arms, x_phys = place
     on_root(world, prepare_folder, folder)
     tell(world, choose_coordinates(*place, Profile()))
     with together(world):

@@ -47,7 +47,7 @@ from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.profiling import Profile
-from dolfinopt.scene.duration import file_stamp
+from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.law_variables import law_bounds, law_names, law_values, with_law
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import place_of
@@ -76,7 +76,7 @@ def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
     """
     lengths = tuple((arm.name, arm.length) for arm in scene.arms)
     key = (scene.motion, lengths, scene.joints, scene.closures, scene.end_effector)
-    return partial(_motion_at, _first_of(_Moving(key, scene)), file_stamp(scene.motion))
+    return partial(_motion_at, _first_of(_Moving(key, scene)), stamp(scene.motion.file))
 
 
 @dataclass(frozen=True)

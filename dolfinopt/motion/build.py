@@ -37,7 +37,7 @@ from dolfinopt.multibody.tree import (
     with_bearings,
 )
 from dolfinopt.scene.csv_table import BESIDE_JOINTS, TIME, Table, column_names, read_table
-from dolfinopt.scene.duration import POINT, SAME_TIME, SPACE_POINT, file_stamp, time_law
+from dolfinopt.scene.duration import POINT, SAME_TIME, SPACE_POINT, stamp, time_law
 from dolfinopt.scene.laws import Values
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.arms import Arm
@@ -56,7 +56,7 @@ Result = TypeVar("Result")
 def _kept(function: Callable[[Scene], Result]) -> Callable[[Scene], Result]:
     """Keep results of scenes until their table is written anew: motions are asked for often."""
     kept = lru_cache(lambda scene, stamp: function(scene))
-    return wraps(function)(lambda scene: kept(scene, file_stamp(scene.motion)))
+    return wraps(function)(lambda scene: kept(scene, stamp(scene.motion.file)))
 
 
 def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:

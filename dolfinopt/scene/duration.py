@@ -73,7 +73,7 @@ def path_length(motion: Motion) -> float:
         way = np.subtract(motion.end, motion.start)
         return float(np.hypot(*way) if len(way) == 2 else np.linalg.norm(way))
     assert motion.file is not None
-    return _chords(motion.file, file_stamp(motion))
+    return _chords(motion.file, stamp(motion.file))
 
 
 @lru_cache(maxsize=64)
@@ -88,14 +88,9 @@ def _chords(file: str, stamp: int) -> float:
     return float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum())
 
 
-def file_stamp(motion: Motion) -> int:
-    """Return when the scene's table was last written: a changed one is read anew."""
-    return stamp(motion.file or "")
-
-
-def stamp(file: str) -> int:
-    """Return when a file was last written, ns; 0 where there is none."""
+def stamp(file: str | None) -> int:
+    """Return when a file was last written, ns, by which a changed one is known; 0: never."""
     try:
-        return os.stat(file).st_mtime_ns
+        return os.stat(file or "").st_mtime_ns
     except (OSError, ValueError):
         return 0
