@@ -13,7 +13,8 @@ from mpi4py import MPI
 from scipy.io import savemat
 
 from dolfinopt.arms.arm import Arm, fixed_body
-from dolfinopt.cli.shared import claim, prepare, scene_of, tell, warn
+from dolfinopt.cli.begin import warn
+from dolfinopt.cli.shared import claim, load, scene_of, tell
 from dolfinopt.data import filled
 from dolfinopt.disk import write_arrays, write_atomically
 from dolfinopt.dynamics.build import check_instant
@@ -28,8 +29,8 @@ from dolfinopt.exchange.urdf.scene import Origin, read_origin
 from dolfinopt.interrupt import ending_at_once
 from dolfinopt.loading import load_scene
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.output.design import arms_with_design, under_law_of
-from dolfinopt.output.folders import PARTS, remove_stale, stale_parts, write_files
+from dolfinopt.output.design import arms_with_design
+from dolfinopt.output.folders import PARTS, prepare_folder, remove_stale, stale_parts, write_files
 from dolfinopt.parallel import gather_arms, on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.responses.evaluation import decide_stiffening
@@ -38,18 +39,77 @@ from dolfinopt.responses.order_selection import choose_coordinates
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.sid import sid_arrays, write_sid
 
+# Options that each format takes besides --out and --overwrite.
+FORMATS = {"bodies": ("design", "set"), "robot": (), "state-space": ("design", "set", "below")}
+
+
+def export(
+    world: MPI.Comm,
+    scene: Path,
+    kind: str,
+    last: str | None,
+    design: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    overrides: tuple[str, ...],
+    below: float | None,
+) -> None:
+    """Write what other programs need of a scene: bodies, a robot, a linearised machine."""
+    for name, value in (("design", design), ("set", overrides), ("below", below)):
+        if value not in (None, ()) and name not in FORMATS[kind]:
+            users = " or ".join(word for word, options in FORMATS.items() if name in options)
+            raise InputError(f"--{name}: expected with {users}, not with {kind}")
+    is_run = scene.is_dir()
+    if kind == "bodies" and is_run:
+        raise InputError(f"{scene}: a folder; name a scene file, or add robot or state-space")
+    if kind == "bodies" and last is not None:
+        raise InputError(f"{last}: expected nothing behind {kind}")
+    at = _instant(last) if kind == "state-space" else 0.0
+    if is_run and design is not None:
+        raise InputError("--design: expected none with the folder of a run, which has its own")
+    if not is_run and kind != "robot":
+        loaded = load(world, scene, overrides)
+    elif overrides:
+        raise InputError("--set: expected none with the folder of a run, whose scene it is")
+    else:
+        loaded = on_root(world, scene_of, scene)
+    if kind == "robot":
+        _export_robot(world, loaded, scene, out, overwrite, None if last is None else Path(last))
+        return
+    folder = out or Path("results") / f"{scene.stem}-{kind}"
+    if kind == "bodies":
+        _export_bodies(world, loaded, folder, overwrite, design)
+        return
+    if is_run:
+        design, folder = scene / "design.npz", out or scene / kind
+    _export_state_space(world, loaded, folder, overwrite, design, at, below)
+
+
+def _instant(word: str | None) -> float:
+    """Return the instant, s, that stands behind state-space."""
+    try:
+        return float(word or "")
+    except ValueError:
+        raise InputError(
+            f"state-space: expected an instant, s, behind it, found {word or 'nothing'}: "
+            "export SCENE state-space T"
+        ) from None
+
+
+# -- bodies --------------------------------------------------------------------------------------
+
 KINDS = (".sid", ".sid.npz", ".fem")
 
 
-def export_bodies(
+def _export_bodies(
     world: MPI.Comm, scene: Scene, folder: Path, overwrite: bool, design: Path | None
 ) -> None:
     """Write the reduced arms of a scene."""
     names = [f"{arm.name}{kind}" for arm in scene.arms for kind in KINDS]
     claim(world, folder, overwrite, names, scene=scene)
     place = arms_with_design(world, scene, design, Profile())
-    _, partition, arms, x_phys = place
-    prepare(world, folder)
+    scene, partition, arms, x_phys = place
+    on_root(world, prepare_folder, folder)
     tell(world, choose_coordinates(*place, Profile()))
     with together(world):
         for k, arm in arms.items():
@@ -77,7 +137,7 @@ def export_bodies(
 STATE_SPACE = ("state_space.npz", "state_space.mat")
 
 
-def export_state_space(
+def _export_state_space(
     world: MPI.Comm,
     scene: Scene,
     folder: Path,
@@ -90,11 +150,10 @@ def export_state_space(
     check_instant(scene, at)
     claim(world, folder, overwrite, STATE_SPACE, scene=scene)
     profile = Profile()
-    scene = on_root(world, under_law_of, scene, design)
     place = arms_with_design(world, scene, design, profile)
     tell(world, choose_coordinates(*place, profile))
     model = linearised_machine(*place, at, profile, below=below)
-    prepare(world, folder)
+    on_root(world, prepare_folder, folder)
     with together(world):
         if world.rank == 0:
             _write_state_space(folder, model)
@@ -154,7 +213,7 @@ def _exported(arm: Arm, thickness: float, x_phys: Any) -> Any:
 PAGES = ("before_after.md", "before_after.csv", "before_after.html")
 
 
-def export_robot(
+def _export_robot(
     world: MPI.Comm, scene: Scene, run: Path, out: Path | None, overwrite: bool, before: Path | None
 ) -> None:
     """Write the robot that a run's scene was imported from, its solid links as they are now.

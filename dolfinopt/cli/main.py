@@ -8,7 +8,7 @@ import os
 import re
 import sys
 import textwrap
-from contextlib import AbstractContextManager, nullcontext, redirect_stdout
+from contextlib import ExitStack, redirect_stdout
 from fnmatch import fnmatchcase
 from io import StringIO
 from itertools import chain
@@ -17,11 +17,7 @@ from typing import Any
 
 import click
 
-from dolfinopt.cli.exchange import export, import_robot
-from dolfinopt.cli.optimize import gradient, optimize, plot, simulate
-from dolfinopt.cli.part import part
-from dolfinopt.cli.shared import OPTIONS, PATH, Start, end_before_start, options, warn
-from dolfinopt.cli.studies import bench, compare, reproduce, sweep, uncertainty
+from dolfinopt.cli.begin import TABLES, command, end_before_start, parameters, warn
 from dolfinopt.data import template_folder
 from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
@@ -35,23 +31,9 @@ from dolfinopt.version import __version__
 
 # -- `dolfinopt init` ----------------------------------------------------------------------------
 
-TEMPLATES = {
-    "two-arm": "two arms on a cart, half a circle (default)",
-    "pick-and-place": "two arms on a fixed base, a path through points, gravity",
-    "single-arm": "one arm on a fixed joint lifts a payload against gravity",
-    "step": "arms of your own shape, from a STEP file",
-}
 
-
-@click.command(
-    help="Write a commented scene, NAME.toml (default: scene.toml).\n\n"
-    "\b\nTEMPLATE is one of\n"
-    + "\n".join(f"  {name:<16}{what}" for name, what in TEMPLATES.items())
-)
-@click.argument("name", default="scene", type=PATH)
-@click.argument("template", type=click.Choice(list(TEMPLATES)), default="two-arm")
-@options("init")
 def init(name: Path, template: str, older: str | None) -> None:
+    """Write a commented scene, and the schema of its keys."""
     if launched_rank():  # the root does it
         return
     template = older or template
@@ -71,29 +53,22 @@ def init(name: Path, template: str, older: str | None) -> None:
     check_new(path.with_name(name) for name in texts)
     write_files(path.parent, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n", **texts})
     written = ", ".join(os.fspath(path.with_name(name)) for name in texts)
-    click.echo(f"{written}: edit the values that differ for your machine")
-    click.echo(f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)")
-    if template == "step":
-        click.echo(f"put your STEP file beside it, as {path.with_name('arm.step')}")
-    click.echo("then:")
-    click.echo(f"  dolfinopt simulate {path}    # what the machine does with half the material")
-    click.echo(f"  dolfinopt optimize {path}")
+    told = [
+        f"{written}: edit the values that differ for your machine",
+        f"{schema}: completes the keys in editors that know JSON schema (Taplo and others)",
+        *[f"put your STEP file beside it, as {path.with_name('arm.step')}"] * (template == "step"),
+        "then:",
+        f"  dolfinopt simulate {path}    # what the machine does with half the material",
+        f"  dolfinopt optimize {path}",
+    ]
+    click.echo("\n".join(told))
 
 
 # -- `dolfinopt keys` ----------------------------------------------------------------------------
 
 
-@click.command()
-@click.argument("pattern", required=False)
-@options("keys")
 def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
-    """Explain the keys of a scene.
-
-    Lists unit, allowed values, default and meaning of the keys that contain PATTERN (payload, mass)
-    or match its wildcards ("arms.*"); without PATTERN of all keys. "dolfinopt keys material" lists
-    the materials of the catalogue, too, and "dolfinopt keys steel" those whose name contains it.
-    """
-
+    """Explain the keys of a scene, print their schema, or rewrite a scene's older ones."""
     if upgrade is not None:
         _upgrade(upgrade)
         return
@@ -106,10 +81,9 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
     result = [info for info in known if _fits(info, pattern)]
     materials = _materials(pattern, result)
     if not result and not materials:
-        near = difflib.get_close_matches(str(pattern), [info.key for info in known], 3)
-        near += difflib.get_close_matches(
-            str(pattern), sorted({part for info in known for part in info.key.split(".")}), 3
-        )
+        paths = [info.key for info in known]
+        parts = sorted({part for path in paths for part in path.split(".")})
+        near = [x for x in (paths, parts) for x in difflib.get_close_matches(str(pattern), x, 3)]
         hint = f"did you mean {' or '.join(near)}? " if near else ""
         raise InputError(f"{pattern}: no such key; {hint}dolfinopt keys lists all of them")
     click.echo("\n".join([*map(_explained, result), *materials]))
@@ -187,10 +161,10 @@ def _explained(info: KeyInfo) -> str:
 def main() -> None:
     """Run the command line on every rank and exit: 0, 1 (failed), 2 (bad input)."""
     try:
-        with Start() as begun:
+        with ExitStack() as ending:
             try:
                 commands.main(
-                    args=sys.argv[1:], prog_name="dolfinopt", standalone_mode=False, obj=begun
+                    args=sys.argv[1:], prog_name="dolfinopt", standalone_mode=False, obj=ending
                 )
             except click.ClickException as error:
                 raise InputError(_with_help(error)) from None
@@ -210,18 +184,18 @@ def _with_help(error: click.ClickException) -> str:
 
 
 GROUPS = {
-    "Begin": (init, import_robot, keys),
-    "Look": (simulate, plot, gradient),
-    "Design": (optimize, part),
-    "Compare": (sweep, compare, uncertainty),
-    "Files for other programs": (export,),
-    "Evidence": (reproduce, bench),
+    "Begin": ("init", "import", "keys"),
+    "Look": ("simulate", "plot", "gradient"),
+    "Design": ("optimize", "part"),
+    "Compare": ("sweep", "compare", "uncertainty"),
+    "Files for other programs": ("export",),
+    "Evidence": ("reproduce", "bench"),
 }
 
 
 def in_new_words(command: str, words: list[str]) -> list[str]:
     """Return a command line in the words of now, and tell which are older."""
-    older, kept, rest = OPTIONS["older"].get(command, {}), list[str](), iter(words)
+    older, kept, rest = TABLES["older"].get(command, {}), list[str](), iter(words)
     new: dict[str, list[str]] = {option: [] for option in older}
     for word in rest:
         option, stated, value = word.partition("=")
@@ -244,15 +218,15 @@ class _Commands(click.Group):
         for title, group in GROUPS.items():
             with formatter.section(title):
                 formatter.write_dl(
-                    [(str(item.name), item.get_short_help_str(60)) for item in group], col_max=14
+                    [(name, self.commands[name].get_short_help_str(60)) for name in group],
+                    col_max=14,
                 )
 
     def main(self, *args: Any, **kwargs: Any) -> Any:  # type: ignore[override]
         given = kwargs["obj"]
-        silent: AbstractContextManager[Any] = nullcontext()
-        if not isinstance(given, Start) and given.rank > 0:
-            silent = redirect_stdout(StringIO())
-        with silent:
+        with ExitStack() as silent:
+            if launched_rank() if isinstance(given, ExitStack) else given.rank:
+                silent.enter_context(redirect_stdout(StringIO()))  # the root speaks
             return super().main(*args, **kwargs)
 
     def resolve_command(
@@ -277,7 +251,6 @@ class _Commands(click.Group):
     no_args_is_help=False,
 )
 @click.version_option(__version__, prog_name="dolfinopt")
-@options("commands")
 @click.pass_context
 def commands(ctx: click.Context, plots: bool, verbose: bool) -> None:
     """Stiffen the flexible arms of a moving machine by topology optimisation.
@@ -288,6 +261,6 @@ def commands(ctx: click.Context, plots: bool, verbose: bool) -> None:
         click.echo(ctx.get_help())
 
 
-for group in GROUPS.values():
-    for command in group:
-        commands.add_command(command)
+commands.params += parameters("commands")
+for name in chain(*GROUPS.values()):
+    commands.add_command(command(name))

@@ -5,44 +5,43 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from tempfile import TemporaryDirectory
 
 import click
+from mpi4py import MPI
 
+from dolfinopt.cli.begin import elapsed
+from dolfinopt.cli.report import conclude
 from dolfinopt.cli.shared import (
-    PATH,
     claim,
     draw,
-    elapsed,
     in_words,
     load,
-    options,
-    prepare,
     progress,
-    scene_argument,
     scene_of,
-    start,
     tell,
     tell_assumed,
 )
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.optimization.evaluator import Evaluator
+from dolfinopt.optimization.gradient_check import STEPS, check_exact, taylor_test
 from dolfinopt.optimization.measured import PASSING_RATE
-from dolfinopt.output.folders import check_unused, remove_stale, working_alone
+from dolfinopt.optimization.result import RankResult
+from dolfinopt.output import checkpoint, run_folder
+from dolfinopt.output.design import Designed, arms_with_design, read_history, write_gradient
+from dolfinopt.output.folders import check_unused, prepare_folder, remove_stale, working_alone
+from dolfinopt.output.trajectory import read_initial_deviation
+from dolfinopt.parallel import on_root, together
+from dolfinopt.profiling import Profile
 from dolfinopt.progress import with_unit
+from dolfinopt.responses import evaluation
+from dolfinopt.responses.order_selection import choose_coordinates
+from dolfinopt.responses.response import needs
 from dolfinopt.scene.load import Scene
 
-if TYPE_CHECKING:
-    from mpi4py import MPI
 
-    from dolfinopt.optimization.result import RankResult
-    from dolfinopt.output.design import Designed
-    from dolfinopt.profiling import Profile
-
-
-@click.command()
-@scene_argument
-@options("optimize")
 def optimize(
+    world: MPI.Comm,
     scene: Path,
     out: Path | None,
     resume: bool,
@@ -54,14 +53,10 @@ def optimize(
     """Optimise the arms of SCENE for the loads of their motion."""
     if resume and overwrite:
         raise InputError("--resume, --overwrite: expected only one of them")
-    world, loaded = load(scene, overrides)
+    loaded = load(world, scene, overrides)
     loaded.check_designed()
     tell_assumed(world, loaded)
     folder = out or Path("results") / scene.stem
-    from dolfinopt.output import checkpoint
-    from dolfinopt.output.run_folder import optimize as run
-    from dolfinopt.parallel import on_root
-
     if resume:
         on_root(world, checkpoint.check, folder, loaded)
     else:
@@ -71,7 +66,7 @@ def optimize(
     with working_alone(world, folder):  # until all files of the run are written
         try:
             say, most = progress(world, "optimize"), loaded.optimizer.max_iterations
-            result = run(
+            result = run_folder.optimize(
                 loaded,
                 folder,
                 resume=resume,
@@ -90,10 +85,7 @@ def optimize(
 
 def _tell_ahead(world: MPI.Comm, scene: Scene) -> None:
     """Print what straight tubes and bars reach in place of solid links (collective)."""
-    from tempfile import TemporaryDirectory
-
-    from dolfinopt.parallel import together
-    from dolfinopt.study.cases import Runner
+    from dolfinopt.study.cases import Runner  # with pandas
     from dolfinopt.study.sections import ahead
 
     with TemporaryDirectory() as own:
@@ -106,11 +98,8 @@ def _tell_ahead(world: MPI.Comm, scene: Scene) -> None:
 
 def _conclude(folder: Path, result: RankResult, plots: bool, verbose: bool) -> None:
     """Write all that a result leaves behind, and tell of it (collective)."""
-    from dolfinopt.cli.report import conclude
-    from dolfinopt.output.run_folder import write_result
-
     pictures = partial(draw, result) if plots else None
-    summary = write_result(folder, result, elapsed(), pictures=pictures)
+    summary = run_folder.write_result(folder, result, elapsed(), pictures=pictures)
     if summary is not None:
         conclude(result, summary, folder, verbose)
 
@@ -118,10 +107,8 @@ def _conclude(folder: Path, result: RankResult, plots: bool, verbose: bool) -> N
 # -- `dolfinopt simulate` ------------------------------------------------------------------------
 
 
-@click.command()
-@scene_argument
-@options("simulate")
 def simulate(
+    world: MPI.Comm,
     scene: Path,
     design: Path | None,
     out: Path | None,
@@ -130,24 +117,15 @@ def simulate(
     plots: bool,
     verbose: bool,
 ) -> None:
-    """Simulate SCENE with a given design.
-
-    Writes the trajectory, and prints compliance and deviation.
-    """
-    world, loaded = load(scene, overrides)
+    """Simulate a scene with a given design, and tell what it does."""
+    loaded = load(world, scene, overrides)
     tell_assumed(world, loaded)
     folder = out or Path("results") / f"{scene.stem}-simulation"
-    from dolfinopt.output.design import arms_with_design, under_law_of
-    from dolfinopt.output.run_folder import simulated
-    from dolfinopt.parallel import on_root
-    from dolfinopt.profiling import Profile
-
     claim(world, folder, overwrite, scene=loaded)
     profile = Profile()
-    loaded = on_root(world, under_law_of, loaded, design)
     arms = arms_with_design(world, loaded, design, profile)
     with working_alone(world, folder, None if overwrite else partial(check_unused, folder)):
-        result = simulated(arms, profile)
+        result = run_folder.simulated(arms, profile)
         on_root(world, remove_stale, folder)
         _conclude(folder, result, plots, verbose)
 
@@ -155,10 +133,8 @@ def simulate(
 # -- `dolfinopt gradient` ------------------------------------------------------------------------
 
 
-@click.command()
-@scene_argument
-@options("gradient")
 def gradient(
+    world: MPI.Comm,
     scene: Path,
     design: Path | None,
     kind: str | None,
@@ -173,33 +149,23 @@ def gradient(
         raise InputError(f"{out}: --out is a folder; name a file, e.g. {out / 'gradient.npz'}")
     if kind is not None:
         overrides = (*overrides, f'objective.gradient="{kind}"')
-    world, loaded = load(scene, overrides)
+    loaded = load(world, scene, overrides)
     loaded.check_designed()
-    from dolfinopt.optimization.gradient_check import check_exact
-    from dolfinopt.output.design import arms_with_design, under_law_of, write_gradient
-    from dolfinopt.parallel import on_root
-    from dolfinopt.profiling import Profile
-    from dolfinopt.responses.evaluation import evaluate
-    from dolfinopt.responses.evaluation import gradient as slopes
-    from dolfinopt.responses.order_selection import choose_coordinates
-    from dolfinopt.responses.response import needs
-
     claim(world, out.parent, overwrite, [out.name])
     if check:
         check_exact(loaded)
     profile = Profile()
-    loaded = on_root(world, under_law_of, loaded, design)
     place = arms_with_design(world, loaded, design, profile)
-    prepare(world, out.parent)
+    on_root(world, prepare_folder, out.parent)
     if needs(loaded, "motion"):
         tell(world, choose_coordinates(*place, profile))
-    evaluation, trajectory = evaluate(*place, profile, simulated=False)
-    by_cell = slopes(*place[:3], trajectory, profile)
-    write_gradient(out, *place[:3], by_cell, evaluation.objective)
+    result, trajectory = evaluation.evaluate(*place, profile, simulated=False)
+    by_cell = evaluation.gradient(*place[:3], trajectory, profile)
+    write_gradient(out, *place[:3], by_cell, result.objective)
     if world.rank == 0:
         unit = loaded.objective.response.unit
         name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
-        value = with_unit(f"{evaluation.objective:.6g}", unit)
+        value = with_unit(f"{result.objective:.6g}", unit)
         click.echo(f"objective {value}; {name} gradient in {out}")
     if check:
         _check_gradient(world, place, profile)
@@ -207,9 +173,6 @@ def gradient(
 
 def _check_gradient(world: MPI.Comm, place: Designed, profile: Profile) -> None:
     """Print the Taylor test; raise ConvergenceError where a rate is too low."""
-    from dolfinopt.optimization.evaluator import Evaluator
-    from dolfinopt.optimization.gradient_check import STEPS, taylor_test
-
     test = taylor_test(Evaluator(*place[:3], profile), place.x_phys)
     if world.rank == 0:
         steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
@@ -234,22 +197,12 @@ def _check_gradient(world: MPI.Comm, place: Designed, profile: Profile) -> None:
 # -- `dolfinopt plot` ----------------------------------------------------------------------------
 
 
-@click.command()
-@click.argument("folder", metavar="DIR", type=PATH)
-@options("plot")
-def plot(folder: Path, animation: bool) -> None:
+def plot(world: MPI.Comm, folder: Path, animation: bool) -> None:
     """Redraw the pictures of a finished run in DIR."""
-    world = start()
-    from dolfinopt.output.design import arms_with_design, read_history
-    from dolfinopt.output.run_folder import simulated, views_of
-    from dolfinopt.output.trajectory import read_initial_deviation
-    from dolfinopt.parallel import on_root
-    from dolfinopt.profiling import Profile
-
     loaded, profile = on_root(world, scene_of, folder), Profile()
     arms = arms_with_design(world, loaded, folder / "design.npz", profile)
-    result = simulated(arms, profile)
-    views, _ = views_of(result)
+    result = run_folder.simulated(arms, profile)
+    views, _ = run_folder.views_of(result)
     if result.trajectory is None:
         return
     history = folder / "history.csv"

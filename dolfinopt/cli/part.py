@@ -10,34 +10,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from mpi4py import MPI
 
-from dolfinopt.cli.shared import (
-    PATH,
-    Say,
-    claim,
-    elapsed,
-    options,
-    progress,
-    scene_of,
-    start,
-    warn,
-)
+from dolfinopt.cli.begin import elapsed, warn
+from dolfinopt.cli.shared import Say, claim, progress, scene_of
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.output.design import designed
 from dolfinopt.output.folders import prepare_folder
+from dolfinopt.parallel import on_root, together
+from dolfinopt.part.folder import SHAPES, Saved, checkpoint_of_search, file_names, write_parts
+from dolfinopt.part.part import Curves, Meshes, make_parts, mesh_parts
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.design import Part as Asked
 
 if TYPE_CHECKING:
     from dolfinopt.part.check import Check
-    from dolfinopt.part.folder import Saved
     from dolfinopt.part.optimize import Keep, Optimized
-    from dolfinopt.part.part import Meshes, Part
-    from dolfinopt.scene.tables.design import Part as Asked
+    from dolfinopt.part.part import Part
 
 
-@click.command()
-@click.argument("folder", metavar="DIR", type=PATH)
-@options("part")
 def part(
+    world: MPI.Comm,
     folder: Path,
     out: Path | None,
     tool_radius: float | None,
@@ -52,24 +45,9 @@ def part(
     overwrite: bool,
     plots: bool,
 ) -> None:
-    """Make parts for the workshop of the arms optimised in DIR.
-
-    Each arm as STEP (solid, and its face for arms.mesh), DXF (R2010 and R12), SVG and STL, all in
-    millimetres; part.toml is the machine with these parts, to be simulated like any scene. A table
-    compares it with the densities, and with these cut to solid and void.
-
-    Solid arms as STL and 3MF, in millimetres; those whose design is the same over the thickness
-    also as STEP and DXF, to which --tool-radius, --tolerance and --round apply.
-
-    Options override the table [part] of the scene; "dolfinopt keys part" lists its keys.
-    """
+    """Make parts for the workshop of a run's arms; options go before the scene's table [part]."""
     if other := [override for override in overrides if not override.startswith("part.")]:
         raise InputError(f"--set {other[0]}: expected keys of [part], as part.starts=3")
-    world = start()
-    from dolfinopt.parallel import on_root, together
-    from dolfinopt.part.folder import SHAPES, checkpoint_of_search, file_names
-    from dolfinopt.part.part import Curves, make_parts
-
     if resume and overwrite:
         raise InputError("--resume, --overwrite: expected only one of them")
     scene: Scene = on_root(world, scene_of, folder, overrides)
@@ -132,8 +110,6 @@ def _ended_as_interrupted() -> Iterator[None]:
 
 def _meshes(parts: Mapping[int, Part], coarse: bool, say: Say) -> Meshes | None:
     """Return the meshes of all parts; None, and a warning, where one cannot be meshed."""
-    from dolfinopt.part.part import mesh_parts
-
     say("meshes")
     try:
         return mesh_parts(parts, coarse)
@@ -165,7 +141,7 @@ class PartsJob:
 
         What is known is of the parts before, which stand beside these.
         """
-        from dolfinopt.part.check import check_parts
+        from dolfinopt.part.check import check_parts  # a second's imports
 
         if self.meshes is None:
             return self
@@ -180,6 +156,7 @@ class PartsJob:
         self, run: Path, asked: Asked, check: bool, say: Say, keep: Keep, known: Sequence[Saved]
     ) -> PartsJob:
         """Return it with optimised shapes, the parts before beside them in the check."""
+
         from dolfinopt.part.optimize import optimize_parts
 
         def tell(line: str) -> None:
@@ -196,8 +173,6 @@ class PartsJob:
 
     def write(self, run: Path, target: Path, plots: bool) -> None:
         """Write the files, all or none."""
-        from dolfinopt.part.folder import write_parts
-
         prepare_folder(target)
         meshes = None if self.meshes is None else self.meshes.fine
         if self.check is not None:
@@ -208,7 +183,6 @@ class PartsJob:
 
     def draw(self, folder: Path) -> None:
         """Write the picture of the parts, and those of what they do if that is known."""
-        from dolfinopt.output.design import designed
         from dolfinopt.part.optimize import TRUSSES
         from dolfinopt.plots.curves import check_figure
         from dolfinopt.plots.design import parts_figure, stress_figure

@@ -3,62 +3,37 @@
 from __future__ import annotations
 
 import json
-import sys
-import time
-import traceback
-from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import ExitStack, redirect_stdout
+from collections.abc import Callable, Collection
 from functools import partial
-from importlib.util import find_spec
-from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from mpi4py import MPI
 
-from dolfinopt.data import tables_of
-from dolfinopt.errors import ConvergenceError, InputError, MissingLibrary, line_of
-from dolfinopt.interrupt import (
-    INTERRUPTED,
-    end_at_once,
-    end_with_launcher,
-    launched_rank,
-    raise_again,
-)
+from dolfinopt.cli.begin import warn
+from dolfinopt.errors import InputError
+from dolfinopt.loading import doubts, load_scene
+from dolfinopt.mesh.budget import check_budget
+from dolfinopt.optimization.result import Result
+from dolfinopt.optimization.state import HistoryRow
+from dolfinopt.output.design import ArmView, designed
 from dolfinopt.output.folders import (
     CHECKPOINT,
     RUN_FILES,
     check_sources,
     check_unused,
-    prepare_folder,
     stale_parts,
 )
-from dolfinopt.progress import SlowWork, show_slow_work
-from dolfinopt.scene.load import Scene, read_scene, scene_from_dict
+from dolfinopt.parallel import on_root
+from dolfinopt.progress import SlowWork
+from dolfinopt.responses.order_selection import OrderSelection
+from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.messages import assumed
 from dolfinopt.scene.schema import found_again
 
-if TYPE_CHECKING:
-    from mpi4py import MPI
 
-    from dolfinopt.optimization.result import Result
-    from dolfinopt.optimization.state import HistoryRow
-    from dolfinopt.output.design import ArmView
-    from dolfinopt.responses.order_selection import OrderSelection
-
-
-def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
-    """Start MPI; return all ranks, and the scene as the root read and checked it.
-
-    A process alone finds a wrong key before MPI and the solvers are loaded.
-    """
-
-    if launched_rank() is None:
-        read_scene(path, overrides)
-    world = start()
-    # On all ranks: DOLFINx ends PETSc together with the others that have imported it.
-    from dolfinopt.loading import doubts, load_scene
-    from dolfinopt.parallel import on_root
+def load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
+    """Return the scene as the root read and checked it."""
 
     def load() -> Scene:
         scene = load_scene(path, overrides)
@@ -67,11 +42,9 @@ def load(path: Path, overrides: tuple[str, ...]) -> tuple[MPI.Comm, Scene]:
             warn([stale])
         return scene
 
-    from dolfinopt.mesh.budget import check_budget
-
     scene = on_root(world, load)
     check_budget(world, scene)
-    return world, scene
+    return scene
 
 
 def claim(
@@ -87,34 +60,14 @@ def claim(
 
     Or files that `scene` reads: these are not replaced even so.
     """
-    from dolfinopt.parallel import on_root
-
     if scene is not None:
         on_root(world, check_sources, folder, names, scene)
     if not overwrite:
         on_root(world, partial(check_unused, resume=resume), folder, names)
 
 
-_told: set[str] = set()
-
-
-def warn(warnings: Iterable[str]) -> None:
-    """Print the warnings that this command has not told yet."""
-    for warning in warnings:
-        if warning not in _told:
-            _told.add(warning)
-            click.echo(f"dolfinopt: warning: {warning}", err=True)
-
-
-def prepare(world: MPI.Comm, folder: Path) -> None:
-    from dolfinopt.parallel import on_root
-
-    on_root(world, prepare_folder, folder)
-
-
 def scene_of(folder: Path, overrides: tuple[str, ...] = ()) -> Scene:
     """Return the scene of a run, with the coordinates and stiffening that it came to."""
-
     path = folder / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
@@ -145,7 +98,6 @@ def _instead(folder: Path) -> str:
 
 def draw(result: Result, folder: Path, views: list[ArmView], *, animation: bool = False) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
-    from dolfinopt.output.design import designed
     from dolfinopt.plots.curves import (
         deviation_of,
         drives_figure,
@@ -187,160 +139,12 @@ def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
 
 def tell_assumed(world: MPI.Comm, scene: Scene) -> None:
     """Print in one line what the scene does not state and its results depend on."""
-
     if world.rank == 0 and (line := assumed(scene)):
         click.echo(line)
 
 
 def chosen(coordinates: int, error: float) -> str:
     return f"reduction: {coordinates} coordinates an arm, estimated error {error:.2g}"
-
-
-BEGUN = time.perf_counter()
-
-
-def elapsed() -> float:
-    """Return the seconds since the command line began."""
-    return time.perf_counter() - BEGUN
-
-
-# -- options ---------------------------------------------------------------------------------
-
-
-class GivenPath(click.Path):
-    """A path that is not empty: `--out ""` would be the current folder."""
-
-    def __init__(self) -> None:
-        super().__init__(path_type=Path)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if value == "":
-            self.fail("expected a path, found nothing", param, ctx)
-        return super().convert(value, param, ctx)
-
-
-PATH = GivenPath()
-scene_argument = click.argument("scene", type=PATH)
-OPTIONS = tables_of("cli/options.toml")
-TYPES = {
-    "path": PATH,
-    "folder": click.Path(exists=True, file_okay=False),
-    "float": float,
-    "int": int,
-    "positive": click.FloatRange(min=0.0, min_open=True),
-}
-Command = TypeVar("Command", bound=Callable[..., Any])
-
-
-def options(command: str) -> Callable[[Command], Command]:
-    """Give a command the options that options.toml lists for it, in that order."""
-
-    def decorate(function: Command) -> Command:
-        for name, entry in reversed(OPTIONS[command].items()):
-            function = _option(name, **OPTIONS["shared"].get(name, {}) | entry)(function)
-        return function
-
-    return decorate
-
-
-def _option(
-    name: str,
-    option: str = "",
-    type: str = "",
-    choices: Sequence[str] = (),
-    least: int | None = None,
-    usual: bool | None = None,
-    **rules: Any,
-) -> Callable[[Command], Command]:
-    """Return the option of a parameter, see options.toml; `rules` are those of click."""
-    if usual is not None:
-        rules["default"] = partial(_given_before, name, usual)
-    elif "/" in option:
-        rules.setdefault("default", None)  # neither of both
-    kind: Any = click.Choice(choices) if choices else TYPES.get(type)
-    kind = kind if least is None else click.IntRange(least)
-    return click.option(option or f"--{name.replace('_', '-')}", name, type=kind, **rules)
-
-
-def _given_before(name: str, usual: bool) -> bool:
-    """Return what an option before the command says, `dolfinopt --no-plots optimize SCENE`."""
-    return bool(click.get_current_context().find_root().params.get(name, usual))
-
-
-# -- when MPI and PETSc are loaded: by a command that has something to compute, not before -------
-#
-# Whatever can be answered from the words alone (help, completion, a wrong word) is answered without
-# them. A launcher's ranks then know one another only by the environment.
-
-NEEDED = ("petsc4py", "slepc4py", "mpi4py", "dolfinx", "gmsh")
-
-
-class Start:
-    """Loads MPI when a command asks for the ranks; from then on all ranks end together."""
-
-    def __init__(self) -> None:
-        self._ending = ExitStack()
-        self._world: MPI.Comm | None = None
-
-    def __enter__(self) -> Start:
-        if launched_rank():
-            self._ending.enter_context(redirect_stdout(StringIO()))  # the root speaks
-        return self
-
-    def __exit__(self, *error: object) -> bool | None:
-        return self._ending.__exit__(*error)  # type: ignore[arg-type]
-
-    @property
-    def world(self) -> MPI.Comm:
-        """All ranks; the first access starts MPI (collective)."""
-        if self._world is None:
-            missing = [name for name in NEEDED if find_spec(name) is None]
-            if missing:
-                raise MissingLibrary(
-                    f"{', '.join(missing)} not installed; on Debian 12 or 13 run ./dolfinopt.sh, "
-                    "elsewhere: conda install -c conda-forge fenics-dolfinx slepc4py python-gmsh"
-                )
-            end_with_launcher()
-            import petsc4py
-
-            # PETSc would turn a closed pipe or Ctrl-C into an abort with a page of advice.
-            petsc4py.init(["dolfinopt", "-no_signal_handler"])
-            from mpi4py import MPI
-
-            from dolfinopt.parallel import abort_together
-
-            self._world = MPI.COMM_WORLD
-            show_slow_work()
-            if raise_again():
-                self._ending.callback(end_at_once)
-            self._ending.enter_context(abort_together(self._world))
-            if self._world.rank > 0:
-                self._ending.enter_context(redirect_stdout(StringIO()))
-        return self._world
-
-
-def start() -> MPI.Comm:
-    """Return all ranks for the command at work, and start MPI unless that was done."""
-    given = click.get_current_context().obj
-    return given.world if isinstance(given, Start) else given
-
-
-def end_before_start(error: BaseException) -> int:
-    """Report an error that came before MPI was started; return the exit status.
-
-    What all ranks found wrong alike is printed by the first one. The others end with status 0: a
-    launcher kills all ranks as soon as one fails, which could be before the first has spoken.
-    """
-    told_by_another = (launched_rank() or 0) > 0
-    if isinstance(error, InputError | ConvergenceError | KeyboardInterrupt) and told_by_another:
-        return 0
-    if line := line_of(error):
-        print(line, file=sys.stderr)
-    else:
-        traceback.print_exception(error)
-    if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED
-    return 2 if isinstance(error, InputError) else 1
 
 
 # -- how far a command is: a line every few seconds ----------------------------------------------

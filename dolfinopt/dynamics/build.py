@@ -47,7 +47,7 @@ from dolfinopt.multibody.rigid_motion import RigidMotion
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
 from dolfinopt.multibody.tree import AppliedForce
 from dolfinopt.profiling import Profile
-from dolfinopt.scene.duration import file_stamp
+from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.law_variables import law_bounds, law_names, law_values, with_law
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import place_of
@@ -76,7 +76,7 @@ def desired_motion(scene: Scene) -> Callable[[np.ndarray], RigidMotion]:
     """
     lengths = tuple((arm.name, arm.length) for arm in scene.arms)
     key = (scene.motion, lengths, scene.joints, scene.closures, scene.end_effector)
-    return partial(_motion_at, _first_of(_Moving(key, scene)), file_stamp(scene.motion))
+    return partial(_motion_at, _first_of(_Moving(key, scene)), stamp(scene.motion.file))
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def _drives(scene: Scene) -> Drives:
     dependent[passive_coordinates(scene)] = free[passive_coordinates(scene)] = True
     soft = soft_joints(scene)
     for k, item in soft.items():
-        free[k], stiffness[k], damping[k] = True, item.stiffness, item.damping
+        free[k], stiffness[k], damping[k] = True, item.gear_stiffness, item.gear_damping
     for k, rod in enumerate(scene.rods, len(scene.movable)):
         if rod.is_spring:
             free[k], stiffness[k], damping[k] = True, rod.stiffness, rod.damping
@@ -199,8 +199,8 @@ def _drives(scene: Scene) -> Drives:
     friction = friction_of(scene, soft=True)
     springs = Springs(
         joints=np.searchsorted(rows, np.array(motors, dtype=int)),
-        stiffness=np.array([soft[k].stiffness for k in motors]),
-        damping=np.array([soft[k].damping for k in motors]),
+        stiffness=np.array([soft[k].gear_stiffness for k in motors]),
+        damping=np.array([soft[k].gear_damping for k in motors]),
         friction=friction.of(np.array(motors, dtype=int)),
     )
     table = _table_of_forces(scene)

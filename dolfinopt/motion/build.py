@@ -37,11 +37,11 @@ from dolfinopt.multibody.tree import (
     with_bearings,
 )
 from dolfinopt.scene.csv_table import BESIDE_JOINTS, TIME, Table, column_names, read_table
-from dolfinopt.scene.duration import POINT, SAME_TIME, SPACE_POINT, file_stamp, time_law
+from dolfinopt.scene.duration import POINT, SAME_TIME, SPACE_POINT, stamp, time_law
 from dolfinopt.scene.laws import Values
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.arms import Arm
-from dolfinopt.scene.tables.joints import JointParts, joint_parts, place_of
+from dolfinopt.scene.tables.joints import Drive, joint_drives, place_of
 from dolfinopt.scene.tables.machine import Closures
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ Result = TypeVar("Result")
 def _kept(function: Callable[[Scene], Result]) -> Callable[[Scene], Result]:
     """Keep results of scenes until their table is written anew: motions are asked for often."""
     kept = lru_cache(lambda scene, stamp: function(scene))
-    return wraps(function)(lambda scene: kept(scene, file_stamp(scene.motion)))
+    return wraps(function)(lambda scene: kept(scene, stamp(scene.motion.file)))
 
 
 def rigid_motion(t: np.ndarray, scene: Scene) -> RigidMotion:
@@ -411,7 +411,7 @@ def build_mechanism(scene: Scene, bodies: Sequence[ShapeIntegrals]) -> Mechanism
     friction = friction_of(scene, soft=False)
     bearings = {
         k: bearing_body(part.bearing[0], part.bearing[1], scene.dimension)
-        for k, part in enumerate(joint_parts(scene))
+        for k, part in enumerate(joint_drives(scene))
         if part.bearing is not None
     }
     mechanism = _tree(scene, bodies, _loads(scene), friction if friction.acts else None)
@@ -538,16 +538,16 @@ def joints_of(scene: Scene) -> tuple[Joint, ...]:
 def friction_of(scene: Scene, soft: bool) -> Friction:
     """Return the friction (R,) of joints, or of the motors before `soft` gears."""
     result = Friction.none(scene.num_rigid)
-    for k, part in zip(scene.joint_columns, joint_parts(scene), strict=True):
-        if k is not None and part.friction is not None and (part.stiffness > 0.0) == soft:
-            result.viscous[k], result.coulomb[k], result.speed[k] = part.friction
+    for k, part in zip(scene.joint_columns, joint_drives(scene), strict=True):
+        if k is not None and part.friction_law and (part.gear_stiffness > 0.0) == soft:
+            result.viscous[k], result.coulomb[k], result.speed[k] = part.friction_law
     return result
 
 
-def soft_joints(scene: Scene) -> dict[int, JointParts]:
+def soft_joints(scene: Scene) -> dict[int, Drive]:
     """Return the joints whose gear gives way, by their rigid coordinates, ascending."""
-    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
-    result = {k: item for k, item in pairs if k is not None and item.stiffness > 0.0}
+    pairs = zip(scene.joint_columns, joint_drives(scene), strict=True)
+    result = {k: item for k, item in pairs if k is not None and item.gear_stiffness > 0.0}
     return dict(sorted(result.items()))
 
 
@@ -555,8 +555,10 @@ def rotors_of(scene: Scene) -> list[Rotor | None]:
     """Return the rotor of every arm's joint: behind a gear's spring a motor of its own."""
     motors: dict[int | None, int] = {k: place for place, k in enumerate(soft_joints(scene))}
     return [
-        Rotor(part.rotor, part.ratio, motors.get(k)) if k in motors or part.rotor > 0.0 else None
-        for k, part in zip(scene.joint_columns, joint_parts(scene), strict=True)
+        Rotor(part.rotor_inertia, part.gear_ratio or 1.0, motors.get(k))
+        if k in motors or part.rotor_inertia > 0.0
+        else None
+        for k, part in zip(scene.joint_columns, joint_drives(scene), strict=True)
     ]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.scene.csv_table import TIME, Table
-from dolfinopt.scene.laws import SAME, Law, ShapedLaw, Values
+from dolfinopt.scene.laws import SAME, Law, Values
 
 
 def arc(s: np.ndarray, radius: float, flattening: float) -> Values:
@@ -24,9 +24,7 @@ def arc(s: np.ndarray, radius: float, flattening: float) -> Values:
     return p, np.pi * scale * np.column_stack([np.sin(phi), -np.cos(phi)]), -(np.pi**2) * p
 
 
-def rotation(
-    t: np.ndarray, law: Law | ShapedLaw, speed: float, start_angle: float, duration: float
-) -> Values:
+def rotation(t: np.ndarray, law: Law, speed: float, start_angle: float, duration: float) -> Values:
     """Return the angle of a joint that runs up to constant speed, and two derivatives (n, 1).
 
     The law is that of the speed: speed s(t / duration); for the quintic the angle is
@@ -183,7 +181,7 @@ def _values_of(spline: Any) -> Function:
     return lambda u: np.stack([spline(u, order) for order in range(3)])
 
 
-def along(function: Function, law: Law | ShapedLaw, t: np.ndarray, duration: float) -> Values:
+def along(function: Function, law: Law, t: np.ndarray, duration: float) -> Values:
     """Return a curve (n, k) over its way, and two time derivatives, by a law."""
     s, sd, sdd = (value[:, None] for value in law(t, duration))
     value, first, second = function(s[:, 0])

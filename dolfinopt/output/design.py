@@ -291,12 +291,15 @@ def arms_with_design(
 ) -> Designed:
     """Build the arms; return them with the physical densities of a file, or the initial ones.
 
+    The scene is under the law of the file's design.
+
     Raises:
         InputError: the design does not fit the arms.
     """
     from dolfinopt.arms.arm import build_arms, uniform_design
     from dolfinopt.parallel import partition_arms
 
+    scene = on_root(world, under_law_of, scene, design)
     partition = partition_arms(world, scene.cell_counts, undivided=scene.dimension == 2)
     arms = build_arms(scene, partition, profile)
     if design is None:

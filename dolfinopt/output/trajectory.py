@@ -12,7 +12,7 @@ from dolfinopt.data import tables_of
 from dolfinopt.disk import read_arrays, write_arrays, write_table
 from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.tables.joints import joint_parts
+from dolfinopt.scene.tables.joints import joint_drives
 
 # Units of summary.json and history.csv by what they are in.
 UNITS = tables_of("output/units.toml")
@@ -126,9 +126,9 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
     """Return the driven coordinates that may leave the desired motion: control, or soft joints."""
     if scene.control is not None:
         return scene.driven
-    pairs = zip(scene.joint_columns, joint_parts(scene), strict=True)
+    pairs = zip(scene.joint_columns, joint_drives(scene), strict=True)
     names = list(scene.rigid_units)
-    soft = {names[k] for k, item in pairs if k is not None and item.stiffness > 0.0}
+    soft = {names[k] for k, item in pairs if k is not None and item.gear_stiffness > 0.0}
     soft |= {rod.name for rod in scene.rods if rod.is_spring}
     return tuple(name for name in scene.driven if name in soft)
 

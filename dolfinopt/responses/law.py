@@ -16,7 +16,7 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.scene.duration import path_length, time_law
 from dolfinopt.scene.law_variables import LAW, law_names
-from dolfinopt.scene.laws import Law, ShapedLaw
+from dolfinopt.scene.laws import Law, shaped
 from dolfinopt.scene.load import Scene
 
 SHARES = np.linspace(0.0, 1.0, 201)  # of the duration: between them a rate exceeds both by 1e-3
@@ -59,8 +59,7 @@ class PathRate(Response):
         smooth, by_rates = p_norm(np.abs(rates), self.options.exponent)
         scale = path_length(motion) / motion.duration**self.order
         waves = [
-            rates_of(ShapedLaw(NO_LAW, tuple(item)), self.order)
-            for item in np.eye(len(motion.coefficients))
+            rates_of(shaped(NO_LAW, item), self.order) for item in np.eye(len(motion.coefficients))
         ]
         result = [float(by_rates @ (np.sign(rates) * scale * wave)) for wave in waves]
         result.append(-self.order / motion.duration * smooth)
@@ -73,7 +72,7 @@ class PathRate(Response):
         return scale * rates_of(time_law(motion), self.order)
 
 
-def rates_of(law: Law | ShapedLaw, order: int) -> np.ndarray:
+def rates_of(law: Law, order: int) -> np.ndarray:
     """Return d^k s / du^k of a law (n,); the third derivative between even shares is the mean."""
     if order == 3:
         return np.diff(law(SHARES, 1.0)[2]) / np.diff(SHARES)

@@ -8,8 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from dolfinopt.scene.csv_table import TIME, column_names, last_instant, read_table
-from dolfinopt.scene.laws import Law as TimeLaw
-from dolfinopt.scene.laws import Limits, ShapedLaw, law_for
+from dolfinopt.scene.laws import Law, Limits, law_for, shaped
 from dolfinopt.scene.tables.motion import Motion
 
 POINT = ("x", "y")  # columns of a table of points
@@ -17,7 +16,7 @@ SPACE_POINT = ("x", "y", "z")
 SAME_TIME = 1e-9  # share of the duration by which instants and durations may differ
 
 
-def time_law(motion: Motion) -> TimeLaw | ShapedLaw:
+def time_law(motion: Motion) -> Law:
     """Return the law by which the scene runs along its path.
 
     Raises:
@@ -25,7 +24,7 @@ def time_law(motion: Motion) -> TimeLaw | ShapedLaw:
     """
     length = path_length(motion) if limits_of(motion).any else 1.0
     law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
-    return ShapedLaw(law, motion.coefficients) if any(motion.coefficients) else law
+    return shaped(law, motion.coefficients) if any(motion.coefficients) else law
 
 
 known_law = lru_cache(maxsize=64)(law_for)
@@ -39,7 +38,7 @@ def limits_of(motion: Motion) -> Limits:
     return Limits(*(np.inf if value is None else value for value in values))
 
 
-def too_short(law: TimeLaw) -> str:
+def too_short(law: Law) -> str:
     """Return what is wrong with a duration that the limits do not allow."""
     return (
         f"expected at least {law.least:.6g} [s], which motion.max_speed, max_acceleration and "
@@ -74,7 +73,7 @@ def path_length(motion: Motion) -> float:
         way = np.subtract(motion.end, motion.start)
         return float(np.hypot(*way) if len(way) == 2 else np.linalg.norm(way))
     assert motion.file is not None
-    return _chords(motion.file, file_stamp(motion))
+    return _chords(motion.file, stamp(motion.file))
 
 
 @lru_cache(maxsize=64)
@@ -89,14 +88,9 @@ def _chords(file: str, stamp: int) -> float:
     return float(np.linalg.norm(np.diff(rows, axis=0), axis=1).sum())
 
 
-def file_stamp(motion: Motion) -> int:
-    """Return when the scene's table was last written: a changed one is read anew."""
-    return stamp(motion.file or "")
-
-
-def stamp(file: str) -> int:
-    """Return when a file was last written, ns; 0 where there is none."""
+def stamp(file: str | None) -> int:
+    """Return when a file was last written, ns, by which a changed one is known; 0: never."""
     try:
-        return os.stat(file).st_mtime_ns
+        return os.stat(file or "").st_mtime_ns
     except (OSError, ValueError):
         return 0

@@ -145,22 +145,20 @@ def size_rigid(tree: Tree) -> None:
                 arm.setdefault(key, size)
 
 
-def drop_of_meshes(tree: Tree, inherited: set[Loc]) -> None:
-    """Leave out what arms with a body from a file took over and only a mesh has."""
-    for i, arm in enumerate(rows(tree, "arms")):
-        for key in (*PATTERN_KEYS, *MESH_KEYS) if is_sid(arm.get("mesh")) else ():
-            if ("arms", i, key) in inherited:
-                arm.pop(key, None)
-
-
 def measure_bodies(tree: Tree, inherited: set[Loc]) -> None:
-    """Take the length of arms with a body from a file from that, unless it is stated."""
+    """Take the length of arms with a body from a file from that, unless it is stated.
+
+    What they took over and only a mesh has is left out.
+    """
     # Height and thickness are only drawn then: a twentieth of the length unless stated.
     for i, arm in enumerate(rows(tree, "arms")):
         if not is_sid(file := arm.get("mesh")):
             continue
         from dolfinopt.scene.sid import read_sid  # NumPy, which other scenes do not need
 
+        for key in (*PATTERN_KEYS, *MESH_KEYS):
+            if ("arms", i, key) in inherited:
+                arm.pop(key, None)
         nodes = read_sid(Path(file)).nodes
         if not nodes:
             raise InputError(

@@ -14,8 +14,8 @@ stage begins one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from math import inf, sqrt
 
 import numpy as np
@@ -53,20 +53,29 @@ class Law:
         pieces: (4, k, m) coefficients in powers of u - start of the integral of s, of s, and of its
             two derivatives by u.
         least: shortest duration, s; 0 without limits.
+        change: what is added to s between the ends, see `shaped`.
     """
 
     starts: np.ndarray
     pieces: np.ndarray
     least: float
+    change: Polynomial = field(default_factory=lambda: Polynomial([0.0]))
 
     def __call__(self, t: np.ndarray, duration: float) -> Values:
         """Return s in [0, 1] and two time derivatives (n,) at instants t (n,), s."""
-        _, s, sd, sdd = self._derivatives(t / duration)
-        return s, sd / duration, sdd / duration**2
+        u = t / duration
+        moving = (u > 0.0) & (u < 1.0)  # at the ends it rests exactly
+        s, sd, sdd = (
+            (item + moving * self.change.deriv(k)(u)) / duration**k
+            for k, item in enumerate(self._derivatives(u)[1:])
+        )
+        return s, sd, sdd
 
     def integral(self, t: np.ndarray, duration: float) -> np.ndarray:
         """Return the integral of s over time up to instants t (n,), s."""
-        return self._derivatives(t / duration)[0] * duration
+        more = self.change.integ()(np.clip(t / duration, 0.0, 1.0))
+        result: np.ndarray = (self._derivatives(t / duration)[0] + more) * duration
+        return result
 
     @property
     def knots(self) -> np.ndarray:
@@ -88,50 +97,19 @@ class Law:
         return values
 
 
-@dataclass(frozen=True, eq=False)
-class ShapedLaw:
-    """A time law s(u) + (4 u (1 - u))^3 sum_k c_k P_k(2 u - 1), of Legendre polynomials P_k.
+def shaped(law: Law, coefficients: Sequence[float]) -> Law:
+    """Return s(u) + (4 u (1 - u))^3 sum_k c_k P_k(2 u - 1), of Legendre polynomials P_k.
 
-    It begins and ends with the speed and acceleration of s, whatever the coefficients.
+    It begins and ends with the speed and acceleration of s, whatever the coefficients, and limits
+    along the path are none of it.
 
-    Attributes:
-        base: s.
+    Args:
+        law: s.
         coefficients: (N,) c, shares of the way.
     """
-
-    base: Law
-    coefficients: tuple[float, ...]
-
-    def __call__(self, t: np.ndarray, duration: float) -> Values:
-        """Return its value and two time derivatives (n,) at instants t (n,), s."""
-        u = t / duration
-        moving = (u > 0.0) & (u < 1.0)  # at the ends it rests exactly
-        s, sd, sdd = (
-            item + moving * self._change.deriv(k)(u) / duration**k
-            for k, item in enumerate(self.base(t, duration))
-        )
-        return s, sd, sdd
-
-    def integral(self, t: np.ndarray, duration: float) -> np.ndarray:
-        """Return the integral of its value over time up to instants t (n,), s."""
-        more = self._change.integ()(np.clip(t / duration, 0.0, 1.0))
-        return self.base.integral(t, duration) + duration * more
-
-    @property
-    def knots(self) -> np.ndarray:
-        """Shares of the duration inside at which its second or third derivative jumps."""
-        return self.base.knots
-
-    @property
-    def least(self) -> float:
-        """Shortest duration, s: limits along the path are none of a shaped law."""
-        return 0.0
-
-    @cached_property
-    def _change(self) -> Polynomial:
-        bump = Polynomial([0.0, 4.0, -4.0]) ** 3
-        waves = Legendre(self.coefficients, domain=[0.0, 1.0]).convert(kind=Polynomial)
-        return bump * waves
+    bump = Polynomial([0.0, 4.0, -4.0]) ** 3
+    waves = Legendre(coefficients, domain=[0.0, 1.0]).convert(kind=Polynomial)
+    return replace(law, change=bump * waves, least=0.0)
 
 
 def law_for(name: str, length: float, limits: Limits, share: float) -> Law:

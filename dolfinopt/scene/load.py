@@ -103,7 +103,6 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     inherited |= inheritance.inherit(tree, required)
     inheritance.size_rigid(tree)
     inheritance.take_from_owners(tree, inherited)
-    inheritance.drop_of_meshes(tree, inherited)
     _fill_material(tree, source, changes)
     _resolve_files(tree, source, changes)
     inheritance.drop_sizes(tree, sizes)

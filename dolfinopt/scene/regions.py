@@ -56,10 +56,11 @@ def region_cells(arm: Arm, centroid: np.ndarray) -> RegionCells:
         sides += [(b, -c) for b, c in sides]
     each = [np.any([r.covers(x, b, c) for b, c in sides], axis=0) for r in arm.regions]
     nothing = np.zeros(len(centroid), dtype=bool)
-    masks = {"solid": nothing.copy(), "void": nothing.copy()}
-    for region, inside in zip(arm.regions, each, strict=True):
-        masks[region.kind] |= inside
-    return RegionCells(masks["solid"], masks["void"], tuple(each))
+    solid, void = (
+        np.any([nothing, *(x for r, x in zip(arm.regions, each) if r.kind == kind)], axis=0)
+        for kind in ("solid", "void")
+    )
+    return RegionCells(solid, void, tuple(each))
 
 
 def region_problem(arm: Arm, cells: Cells) -> tuple[int, str] | None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, get_args
 
@@ -31,6 +31,8 @@ from dolfinopt.scene.tables.machine import (
     Force,
     Joint,
     Payload,
+    check_machine,
+    check_tree,
 )
 from dolfinopt.scene.tables.material import Material, material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction, Simulation
@@ -357,6 +359,9 @@ class Scene(Table):
             for i, table in enumerate(tables):
                 if isinstance(table, Table):
                     table.check_at(self, (key, i) if tables is value else (key,))
+            if key == "joints" and self.is_spatial:
+                check_tree(self)
+                check_machine(self)
 
 
 # Keys that name a file, as (table, key); a scene holds their absolute paths.
@@ -460,28 +465,34 @@ def named_files(data: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any], 
                 yield f"{place}.{key}", row, key
 
 
+def with_files(data: Mapping[str, Any], named: Callable[[str, str], str]) -> dict[str, Any]:
+    """Return a scene's data with other names of files, by their dotted keys and names."""
+    tree = copy.deepcopy(dict(data))
+    for name, row, key in named_files(tree):
+        row[key] = named(name, row[key])
+    return tree
+
+
 def with_digests(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scene's data with digests of the files' content in place of their paths.
 
     Raises:
         InputError: a file cannot be read.
     """
-    tree = copy.deepcopy(dict(data))
-    for _, row, key in named_files(tree):
-        row[key] = DIGEST + file_digest(Path(row[key]))
-    return tree
+    return with_files(data, lambda _, file: DIGEST + file_digest(Path(file)))
 
 
 def with_relative_paths(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return a scene's data with paths from `folder`; the package's own meshes keep their name."""
-    tree, own = copy.deepcopy(dict(data)), mesh_folder()
-    for _, row, key in named_files(tree):
-        path = Path(row[key])
+    own = mesh_folder()
+
+    def relative(_: str, file: str) -> str:
+        path = Path(file)
         if path.parent == own:
-            row[key] = f"{own.name}/{path.name}"
-        else:
-            row[key] = Path(os.path.relpath(path, folder.absolute())).as_posix()
-    return tree
+            return f"{own.name}/{path.name}"
+        return Path(os.path.relpath(path, folder.absolute())).as_posix()
+
+    return with_files(data, relative)
 
 
 def found_again(
@@ -496,12 +507,12 @@ def found_again(
         folder: of the file that held them.
         absolute: paths at the time of writing by dotted key.
     """
-    tree = copy.deepcopy(dict(data))
-    for name, row, key in named_files(tree):
-        known = absolute.get(name)
-        if known and not (folder / row[key]).is_file() and Path(known).is_file():
-            row[key] = known
-    return tree
+
+    def known(name: str, file: str) -> str:
+        there = absolute.get(name, "")
+        return there if Path(there).is_file() and not (folder / file).is_file() else file
+
+    return with_files(data, known)
 
 
 def file_digest(path: Path) -> str:

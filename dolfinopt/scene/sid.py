@@ -28,9 +28,9 @@ doi:10.1080/08905459408905214; Schwertassek & Wallrapp, Dynamik flexibler MehrkÃ
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,6 @@ from dolfinopt.data import filled
 from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
 
-Items = dict[str, Callable[[], Any]]  # how the items of a block are read
 MOST = 500  # coordinates: every matrix is kept with its derivative by all of them
 
 _END = re.compile(r"end\s+(?:of\s+)?(\w+)\s*$", re.IGNORECASE)
@@ -224,13 +223,8 @@ def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
 
 
 def write_sid(path: Path, data: StandardInputData) -> None:
-    """Write the text file; `read_sid` gets the same bits back."""
-    write_text(path, sid_text(data))
-
-
-def sid_text(data: StandardInputData) -> str:
-    """Return the content of the text file, numbers with 17 digits and Fortran's exponent."""
-    return filled(
+    """Write the text file, numbers with 17 digits; `read_sid` gets the same bits back."""
+    text = filled(
         "body.sid.jinja",
         {"number": _number, "written": _written},
         data=data,
@@ -238,6 +232,7 @@ def sid_text(data: StandardInputData) -> str:
         of_node=NODE,
         of_body=BODY,
     )
+    write_text(path, text)
 
 
 def _number(value: float) -> str:
@@ -271,13 +266,26 @@ def _filled(values: np.ndarray) -> np.ndarray:
 
 # -- reading it --------------------------------------------------------------------------------
 
+HEADER_LIMITS = {"order": 1, "nqn": 0, "structure": UNIT}  # largest numbers
+# What stands in every block, and which of it may stand there more than once.
+MATRICES = BODY | NODE
+ITEMS: dict[str, tuple[str, ...]] = {
+    "part": ("modal",),
+    "modal": ("refmod", *BODY, "frame"),
+    "refmod": ("mass", "nelastq", "ielastq"),
+    "frame": ("node",),
+    "node": (*NODE, "rframe"),
+    **dict.fromkeys(MATRICES, (*HEADER, "m0", "m1")),
+}
+MANY = ("frame", "ielastq", "node", "rframe", "m0", "m1")
+
 
 def read_sid(path: Path) -> StandardInputData:
     """Read the text file.
 
-    Spacing and case do not matter, blocks may come in any order, zeros may be left out, as well
-    as the half of a symmetric and the entries of a unit matrix; `begin of x` and `end of x` are
-    as good as `x` and `end x`.
+    Spacing and case do not matter, blocks and their items may come in any order, zeros may be left
+    out, as well as the half of a symmetric and the entries of a unit matrix; `begin of x` and
+    `end of x` are as good as `x` and `end x`.
 
     Raises:
         InputError: one line with the file, the line, what was found and what was expected.
@@ -286,62 +294,137 @@ def read_sid(path: Path) -> StandardInputData:
         text = path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); name an SID file") from None
-    return _Reader(path, text).part()
+    lines = _lines(path, text)
+    part = next(line for line in lines if line.is_part or not line.text)
+    if not part.is_part:
+        raise part.fail("'part'")
+    first = text.splitlines()[0] if part.number > 1 else ""
+    modal = part.with_items("part", lines).one("modal")
+    refmod = modal.one("refmod")
+    nq = refmod.one("nelastq").integer(MOST)
+    names = [""] * nq
+    for item in refmod.items["ielastq"]:
+        names[item.place((nq,))[0]] = item.value or ""
+    return StandardInputData(
+        refmod.one("mass").real(),
+        tuple(names),
+        _nodes(modal, nq),
+        **{name: _taylor(modal.one(name), name, nq) for name in BODY},
+        comment=first.split("modes:", 1)[-1].strip(),
+    )
 
 
-class _Reader:
-    """A file's lines, one looked at at a time."""
+def _nodes(modal: _Item, nq: int) -> tuple[Node, ...]:
+    """Return the nodes of all frames."""
+    nodes: dict[str, Node] = {}
+    for item in (node for frame in modal.items["frame"] for node in frame.items["node"]):
+        name = item.value or ""
+        if not name or name in nodes:
+            raise item.fail("'new node =' and a name of its own")
+        rframe = [frame.value or "" for frame in item.items["rframe"]]
+        matrices = {
+            key: _taylor(item.one(key, f"of node {name}"), key, nq)
+            for key in NODE
+            if key != "sigma" or key in item.items
+        }
+        nodes[name] = Node(name, rframe[-1] if rframe else "", **matrices)
+    return tuple(nodes.values())
 
-    def __init__(self, path: Path, text: str):
-        self.path = path
-        self.lines = text.splitlines()
-        self.number = 0  # of the line looked at, from one
-        self.text = ""
-        self.end: str | None = None  # the block that ends here
-        self.name = ""  # of the item that stands here, in lower case
-        self.indices: str | None = None
-        self.value: str | None = None
+
+def _taylor(block: _Item, name: str, nq: int) -> Taylor:
+    """Return one matrix, its dimensions checked."""
+    order, *shape, count, nqn, structure = (
+        block.one(key, f"of {name}").integer(HEADER_LIMITS.get(key, 10_000_000)) for key in HEADER
+    )
+    size: dict[Any, int] = {"nq": nq, "3nq": 3 * nq}
+    allowed = [[size.get(n, n) for n in dimensions] for dimensions in MATRICES[name]]
+    if shape not in allowed:
+        choices = " or ".join(f"{rows} x {cols}" for rows, cols in allowed)
+        found = f"{shape[0]} x {shape[1]}, for nelastq = {nq}"
+        raise block.end.fail(f"{name} of {choices}, not {found}")
+    if count != nq and (order > 0 or count != 0):
+        raise block.end.fail(f"nq = {nq} of {name}, not {count}")
+    M0 = np.zeros(shape)
+    M1 = np.zeros((shape[0], count, shape[1]))
+    first, second = block.entries("m0", M0.shape), block.entries("m1", M1.shape)
+    if second and order == 0:
+        raise block.end.fail(f"no m1 in {name}, which is of order 0")
+    if first and structure == ZERO:
+        raise block.end.fail(f"no m0 in {name}, whose structure 0 says zero")
+    if structure == UNIT and not first:
+        np.fill_diagonal(M0, 1.0)
+    if structure == SYMMETRIC and shape[0] == shape[1]:
+        first = {index[::-1]: value for index, value in first.items()} | first
+    for array, values in ((M0, first), (M1, second)):
+        for index, value in values.items():
+            array[index] = value
+    return Taylor(M0, M1, order, structure, nqn)
+
+
+@dataclass
+class _Item:
+    """A line of a file that is not empty; of a block what stands in it, and the line of its end.
+
+    Attributes:
+        path, number: of the file, and of the line from one.
+        text: of the line; "" behind the file's last one.
+        name: of what stands there, in lower case; "end" and the name at the end of a block.
+        indices, value: in parentheses, and behind the equals sign; None without.
+        items: of a block, by their names.
+    """
+
+    path: Path
+    number: int
+    text: str = ""
+    name: str = ""
+    indices: str | None = None
+    value: str | None = None
+    items: dict[str, list[_Item]] = field(default_factory=lambda: defaultdict(list))
+
+    @property
+    def is_part(self) -> bool:
+        """Whether all that is read begins here."""
+        return self.name == "part" and self.value is None
+
+    @property
+    def end(self) -> _Item:
+        """The line of a block's end."""
+        return self.items["end"][0]
 
     def fail(self, expected: str) -> InputError:
         shown = self.text if len(self.text) <= 60 else self.text[:57] + "..."
-        return InputError(f"{self.path}, line {self.number}: found {shown!r}, expected {expected}")
+        found = f"found {shown!r}" if shown else "the file ends"
+        return InputError(f"{self.path}, line {self.number}: {found}, expected {expected}")
 
-    def next(self, expected: str) -> None:
-        """Go to the next line that is not empty."""
-        while self.number < len(self.lines):
-            self.text = self.lines[self.number].strip()
-            self.number += 1
-            if not self.text:
-                continue
-            end, item = _END.match(self.text), _ITEM.match(self.text)
-            self.end = end[1].lower() if end else None
-            self.name, self.indices, self.value = "", None, None
-            if item and not end:
-                self.name, self.indices = item[1].lower(), item[2]
-                self.value = None if item[3] is None else item[3].strip()
-            return
-        raise InputError(f"{self.path}, line {len(self.lines)}: the file ends, expected {expected}")
+    def with_items(self, name: str, lines: Iterator[_Item]) -> _Item:
+        """Return this block with the items up to its end."""
+        known = {key.lower(): key for key in ITEMS[name]}
+        choices = ", ".join(map(repr, [*ITEMS[name], f"end {name}"]))
+        for item in lines:
+            if item.name == f"end {name.lower()}":
+                self.items["end"].append(item)
+                break
+            if (key := known.get(item.name)) is None:
+                raise item.fail(choices)
+            if key in self.items and key not in MANY:
+                raise item.fail(f"{key!r} only once")
+            self.items[key].append(item.with_items(key, lines) if key in ITEMS else item)
+        return self
 
-    def block(self, name: str, once: Items, often: Items, items: dict[str, Any]) -> dict[str, Any]:
-        """Read the items of a block up to its end; into `found` those that may stand once."""
-        choices = ", ".join(map(repr, [*once, *often, f"end {name}"]))
-        known = {key.lower(): key for key in (*once, *often)}
-        while True:
-            self.next(choices)
-            if self.end == name.lower():
-                return items
-            if (key := known.get(self.name)) is None:
-                raise self.fail(choices)
-            if key in items:
-                raise self.fail(f"{key!r} only once")
-            value = (once[key] if key in once else often[key])()
-            if key in once:
-                items[key] = value
+    def one(self, key: str, told: str = "") -> _Item:
+        """Return the item of a block that it must have."""
+        if key not in self.items:
+            raise self.end.fail(" ".join(filter(None, (repr(key), told, "before"))))
+        return self.items[key][0]
 
-    def complete(self, items: Mapping[str, Any], names: Iterable[str], told: str) -> None:
-        for name in names:
-            if name not in items:
-                raise self.fail(f"{name!r} {told}")
+    def entries(self, key: str, shape: tuple[int, ...]) -> dict[tuple[int, ...], float]:
+        """Return the numbers of a block by their indices."""
+        result: dict[tuple[int, ...], float] = {}
+        for item in self.items[key]:
+            if (index := item.place(shape)) in result:
+                raise item.fail("every entry only once")
+            result[index] = item.real()
+        return result
 
     def real(self) -> float:
         value = (self.value or "").lower().replace("d", "e")
@@ -354,10 +437,10 @@ class _Reader:
             raise self.fail("= and a finite number")
         return number
 
-    def integer(self, low: int, high: int) -> int:
+    def integer(self, high: int) -> int:
         value = self.value or ""
-        if not re.fullmatch(r"[+-]?\d+", value) or not low <= int(value) <= high:
-            raise self.fail(f"= and an integer from {low} to {high}")
+        if not re.fullmatch(r"[+-]?\d+", value) or not 0 <= int(value) <= high:
+            raise self.fail(f"= and an integer from 0 to {high}")
         return int(value)
 
     def place(self, shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -368,102 +451,16 @@ class _Reader:
             raise self.fail(f"indices ({', '.join(f'1..{n}' for n in shape)})")
         return tuple(int(x) - 1 for x in parts)
 
-    def part(self) -> StandardInputData:
-        """Read the whole file: a comment, then the part."""
-        while self.name != "part" or self.value is not None:
-            self.next("'part'")
-        comment = self.lines[0].split("modes:", 1)[-1].strip() if self.number > 1 else ""
-        result = self.block("part", {"modal": self.modal}, {}, {})
-        if not result:
-            raise self.fail("'new modal' before")
-        return replace(result["modal"], comment=comment)
 
-    def modal(self) -> StandardInputData:
-        result: dict[str, Any] = {}
-        nodes: dict[str, Node] = {}
-
-        def number() -> int:
-            if not result:
-                raise self.fail("'refmod' first, which has the number of coordinates")
-            return len(result["refmod"][1])
-
-        def node() -> None:
-            name = self.value or ""
-            if not name or name in nodes:
-                raise self.fail("'new node =' and a name of its own")
-            nodes[name] = self.node(name, number())
-
-        def frame() -> None:
-            number()
-            self.block("frame", {}, {"node": node}, {})
-
-        once: Items = {"refmod": self.refmod}
-        once |= {key: partial(lambda name: self.taylor(name, number()), key) for key in BODY}
-        self.block("modal", once, {"frame": frame}, result)
-        self.complete(result, ("refmod", *BODY), "before")
-        mass, names = result.pop("refmod")
-        return StandardInputData(mass, names, tuple(nodes.values()), **result)
-
-    def refmod(self) -> tuple[float, tuple[str, ...]]:
-        """Return the mass and the names of the coordinates."""
-        result: dict[str, Any] = {}
-        names: dict[int, str] = {}
-
-        def name() -> None:
-            if "nelastq" not in result:
-                raise self.fail("'nelastq' before the names")
-            (k,) = self.place((result["nelastq"],))
-            names[k] = self.value or ""
-
-        once: Items = {"mass": self.real, "nelastq": partial(self.integer, 0, MOST)}
-        self.block("refmod", once, {"ielastq": name}, result)
-        self.complete(result, once, "before")
-        return result["mass"], tuple(names.get(k, "") for k in range(result["nelastq"]))
-
-    def node(self, name: str, nq: int) -> Node:
-        rframe = [""]
-        once: Items = {key: partial(self.taylor, key, nq) for key in NODE}
-        often: Items = {"rframe": lambda: rframe.append(self.value or "")}
-        result = self.block("node", once, often, {})
-        self.complete(result, (key for key in NODE if key != "sigma"), f"of node {name} before")
-        return Node(name, rframe[-1], **result)
-
-    def taylor(self, name: str, nq: int) -> Taylor:
-        """Read one matrix, check its dimensions and fill it."""
-        header: dict[str, Any] = {}
-        entries: dict[str, dict[tuple[int, ...], float]] = {"m0": {}, "m1": {}}
-
-        def put() -> None:
-            self.complete(header, HEADER, "before the entries")
-            known = entries[self.name]
-            keys = ("nrow", "ncol") if self.name == "m0" else ("nrow", "nq", "ncol")
-            index = self.place(tuple(header[key] for key in keys))
-            if index in known:
-                raise self.fail("every entry only once")
-            known[index] = self.real()
-
-        limits = {"order": 1, "nqn": 0, "structure": UNIT}
-        once: Items = {key: partial(self.integer, 0, limits.get(key, 10_000_000)) for key in HEADER}
-        self.block(name, once, {"m0": put, "m1": put}, header)
-        self.complete(header, HEADER, f"of {name} before")
-        size: dict[Any, int] = {"nq": nq, "3nq": 3 * nq}
-        allowed = [tuple(size.get(n, n) for n in shape) for shape in (BODY | NODE)[name]]
-        order, *shape, count, nqn, structure = (header[key] for key in HEADER)
-        if tuple(shape) not in allowed:
-            choices = " or ".join(f"{rows} x {cols}" for rows, cols in allowed)
-            raise self.fail(f"{name} of {choices}, not {shape[0]} x {shape[1]}, for nelastq = {nq}")
-        if count != nq and (order > 0 or count != 0):
-            raise self.fail(f"nq = {nq} of {name}, not {count}")
-        first, second = entries["m0"], entries["m1"]
-        if second and order == 0:
-            raise self.fail(f"no m1 in {name}, which is of order 0")
-        if first and structure == ZERO:
-            raise self.fail(f"no m0 in {name}, whose structure 0 says zero")
-        M0 = np.eye(*shape) if structure == UNIT and not first else np.zeros(shape)
-        M1 = np.zeros((shape[0], count, shape[1]))
-        if structure == SYMMETRIC and shape[0] == shape[1]:
-            first = {index[::-1]: value for index, value in first.items()} | first
-        for array, values in ((M0, first), (M1, second)):
-            for index, value in values.items():
-                array[index] = value
-        return Taylor(M0, M1, order, structure, nqn)
+def _lines(path: Path, text: str) -> Iterator[_Item]:
+    """Yield the lines that are not empty, and one behind them."""
+    lines = text.splitlines()
+    for number, line in enumerate(map(str.strip, lines), 1):
+        if end := _END.match(line):
+            yield _Item(path, number, line, f"end {end[1].lower()}")
+        elif item := _ITEM.match(line):
+            value = item[3] and item[3].strip()
+            yield _Item(path, number, line, item[1].lower(), item[2], value)
+        elif line:
+            yield _Item(path, number, line)
+    yield _Item(path, len(lines))

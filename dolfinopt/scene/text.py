@@ -13,7 +13,7 @@ def read_text(source: str, remedy: str) -> str:
 
     Args:
         source: its path.
-        remedy: what to do where there is no such file, for messages.
+        remedy: what to do where there is none that can be read, for messages.
 
     Raises:
         InputError: it cannot be read.
@@ -21,12 +21,6 @@ def read_text(source: str, remedy: str) -> str:
     try:
         check_regular(Path(source))
         return Path(source).read_bytes().decode("utf-8-sig")  # editors may add a byte order mark
-    except FileNotFoundError:
-        reason = f"no such file; {remedy}"
-    except IsADirectoryError:
-        reason = f"is a directory; {remedy}"
-    except PermissionError:
-        reason = "permission denied; make the file readable"
     except OSError as error:
         reason = f"cannot be read ({error.strerror}); {remedy}"
     except UnicodeDecodeError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 from dolfinopt.data import tomllib
@@ -20,15 +19,4 @@ def read_toml(source: str, remedy: str = "give the path of a scene file (TOML)")
     except RecursionError:
         raise input_error(source, "not a scene: arrays nested too deeply") from None
     except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
-        raise input_error(source, _syntax_error(str(error), text)) from None
-
-
-def _syntax_error(message: str, text: str) -> str:
-    """Move the place in the parser's message to its front: "line 3, column 5: not valid ..."."""
-    result = re.search(r" \(at (?:line (\d+), column (\d+)|end of document)\)$", message)
-    if not result:
-        return f"not valid TOML: {message}"
-    line, column = result.groups()
-    if line is None:
-        line, column = text.count("\n") + 1, len(text) - text.rfind("\n")
-    return f"line {line}, column {column}: not valid TOML: {message[: result.start()]}"
+        raise input_error(source, f"not valid TOML: {error}") from None

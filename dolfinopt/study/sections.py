@@ -31,7 +31,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh.hollow import KINDS, Section, member
 from dolfinopt.mesh.solid_cells import msh_bytes
 from dolfinopt.progress import with_unit
-from dolfinopt.responses.constraints import EXCESS
+from dolfinopt.responses.constraints import EXCESS, Limit
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.scene.schema import file_digest
 from dolfinopt.scene.tables.arms import WALL_KEYS
@@ -58,8 +58,6 @@ MOVE = 1.0  # largest change of ln s by one set of power laws, halved where they
 WORTH = 3e-3  # relative gain of mass below which the search ends
 PENALTY = 10.0  # of a relative excess over a relative mass: frequencies take most, m^2 and more
 SLIGHT = 0.01  # relative excess of a limit by the design up to which it is told, but no defeat
-# Judged by mass alone where these are all that is limited: they fall with the material.
-OF_MATERIAL = ("volume_fraction", "mass")
 
 Shares = tuple[float, ...]  # of every designed arm, in the scene's order
 Found = tuple[Shares, bool] | None  # whether they hold; None: no simulation succeeded
@@ -181,19 +179,10 @@ def limited(outcome: Outcome) -> dict[str, float]:
     Of lower limits ln(limit / value).
     """
     return {
-        name: math.log(max(1e-9, limit["value"] / limit["limit"])) * _sign(limit)
-        for name, limit in outcome.summary().get("constraints", {}).items()
-        if not name.startswith(OF_MATERIAL)
+        limit.name: math.log(max(1e-9, limit.value / limit.limit)) * (-1.0 if limit.least else 1.0)
+        for limit in _limits(outcome)
+        if not limit.name.startswith("mass")
     }
-
-
-def _sign(limit: Mapping[str, Any]) -> float:
-    return -1.0 if limit["bound"] == "least" else 1.0
-
-
-def _excess(limit: Mapping[str, Any]) -> float:
-    """Return the relative violation of an entry of a summary's constraints."""
-    return float(_sign(limit) * (limit["value"] / limit["limit"] - 1.0))
 
 
 def lightest(members: Members) -> Steps[Found]:
@@ -285,10 +274,13 @@ def _balanced(
 # -- the study -------------------------------------------------------------------------------
 
 
-def _limits(outcome: Outcome) -> dict[str, Any]:
+def _limits(outcome: Outcome) -> list[Limit]:
     """Return the scene's limits and what becomes of them, without that of the volume."""
-    result = outcome.summary().get("constraints", {})
-    return {name: limit for name, limit in result.items() if not name.startswith("volume_fraction")}
+    return [
+        Limit(name, "", item["value"], item["limit"], item["unit"], item["bound"] == "least")
+        for name, item in outcome.summary().get("constraints", {}).items()
+        if not name.startswith("volume_fraction")
+    ]
 
 
 def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps[Study]:
@@ -368,9 +360,9 @@ def _reached(scene: Scene, members: Members, outcome: Outcome) -> str:
     response, limits = scene.objective.response, _limits(outcome)
     value = with_unit(f"{response.label} {outcome.objective:.4g}", response.unit)
     if limits:
-        name, most = max(limits.items(), key=lambda item: _excess(item[1]))
-        used = f"{name.replace('_', ' ')} {most['value']:.3g} of {most['limit']:.3g}"
-        value = f"{value}, {with_unit(used, most['unit'])}"
+        most = max(limits, key=lambda limit: limit.excess)
+        used = f"{most.words} {most.value:.3g} of {most.limit:.3g}"
+        value = f"{value}, {with_unit(used, most.unit)}"
     mass = outcome.summary()["designed_mass"]
     return f"a straight {members.kind} of the links' mass at the start, {mass:.3g} kg: {value}"
 
@@ -396,13 +388,21 @@ def _check_replaceable(scene: Scene) -> None:
 # -- table, sentence, picture ----------------------------------------------------------------
 
 
+def _bound(limit: Limit) -> str:
+    sign = ">=" if limit.least else "<="
+    return f"{limit.words} {sign} " + with_unit(f"{limit.limit:g}", limit.unit)
+
+
 def report(frame: pd.DataFrame, scene: Scene) -> Report:
     """Return the table under the sentence that names the winner, and the deviations over time."""
     objective = f"objective [{scene.objective.response.unit}]"
     known = frame.assign(**{objective: [outcome.objective for outcome in frame["outcome"]]})
     columns = ["section", "made", "sizes [mm]", "mass [kg]", objective, COMPLIANCE, DEVIATION,
                "settling [mm]", "stress [MPa]", "grayness [-]"]  # fmt: skip
-    limits = pd.DataFrame([_limit_cells(outcome) for outcome in frame["outcome"]])
+    limits = pd.DataFrame(
+        {_bound(x): f"{x.value:.4g} {'met' if x.met else 'not met'}" for x in _limits(outcome)}
+        for outcome in frame["outcome"]
+    )
     shown = frame[frame["failure"] == ""]
     if (light := shown["made"] == LIGHTEST).any():
         shown = shown[light | (shown["section"] == DESIGN)]
@@ -428,9 +428,9 @@ def verdict(scene: Scene, frame: pd.DataFrame) -> str:
         able = [
             row
             for row in able
-            if row["made"] == LIGHTEST and all(x["met"] for x in _limits(row["outcome"]).values())
+            if row["made"] == LIGHTEST and all(limit.met for limit in _limits(row["outcome"]))
         ]
-    over = {name: _excess(limit) for name, limit in limits.items() if not limit["met"]}
+    over = {limit.name: limit.excess for limit in limits if not limit.met}
     kinds = {row["section"] for row in others if row["made"] == SAME}
     text = filled(
         "sections.txt.jinja",
@@ -452,16 +452,6 @@ def verdict(scene: Scene, frame: pd.DataFrame) -> str:
         missing=[kind for kind in KINDS[scene.dimension] if kind not in kinds],
     )
     return " ".join(text.split())
-
-
-def _limit_cells(outcome: Outcome) -> dict[str, str]:
-    """Return by column what becomes of every limit."""
-    cells = {}
-    for name, limit in _limits(outcome).items():
-        sign = ">=" if limit["bound"] == "least" else "<="
-        key = f"{name.replace('_', ' ')} {sign} {limit['limit']:g} {limit['unit']}"
-        cells[key] = f"{limit['value']:.4g} {'met' if limit['met'] else 'not met'}"
-    return cells
 
 
 def sections_of(run: Path) -> Table | None:

@@ -39,7 +39,6 @@ from dolfinopt.study.variants import asked_by, axis_of, changed
 # quantiles; what is said of a model rests on its values (n,) at the samples alone.
 
 CONFIDENCE = 0.95  # of all intervals
-TAIL = 0.5 * (1.0 - CONFIDENCE)
 WIDE = float(stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))  # half an interval, in standard errors
 QUANTILES = (0.05, 0.5, 0.95)
 # Quantiles beyond it, at both ends, are out of reach of any number of samples.
@@ -209,15 +208,9 @@ def quantile(values: np.ndarray, share: float) -> Estimate:
     P(x_(l) <= quantile < x_(u)) = P(l <= B < u) with B binomial. Source: David & Nagaraja, Order
     Statistics (2003), 7.1, doi:10.1002/0471722162.
     """
-    ordered = np.sort(values)
-    n = len(ordered)
-    low = int(stats.binom.ppf(TAIL, n, share))
-    high = int(stats.binom.ppf(1.0 - TAIL, n, share)) + 1
-    return Estimate(
-        float(np.quantile(ordered, share)),
-        float(ordered[low - 1]) if low >= 1 else math.nan,
-        float(ordered[high - 1]) if high <= n else math.nan,
-    )
+    low, high = map(int, stats.binom.interval(CONFIDENCE, len(values), share))
+    ordered = [math.nan, *np.sort(values).tolist(), math.nan]
+    return Estimate(float(np.quantile(values, share)), ordered[low], ordered[high + 1])
 
 
 # -- Sobol' indices --------------------------------------------------------------------------

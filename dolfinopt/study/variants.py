@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -73,27 +72,27 @@ def axis_of(key: str) -> str:
 def parse_vary(text: str) -> Vary:
     """Return what "key.path=start:stop:count" or "key.path=a,b,c" asks for, else InputError."""
     key, _, values = (part.strip() for part in text.partition("="))
-    parts, is_range = [part.strip() for part in re.split("[:,]", values)], ":" in values
-    shape = len(parts) == 3 and parts[2].isdigit() and "," not in values if is_range else True
-    if not key or not shape or not all(map(_is_number, parts)):
+    is_range = ":" in values
+    parts = [part.strip() for part in values.split(":" if is_range else ",")]
+    try:
+        numbers = list(map(float, parts))
+        if is_range:
+            start, stop, _ = numbers
+            count = int(parts[2])
+    except ValueError:
+        numbers = [math.nan]
+    if not key or not np.isfinite(numbers).all():
         raise InputError(
             f"--vary {text}: expected key.path=start:stop:count or key.path=a,b,c with numbers, "
             "for example payload.mass=4:8:9"
         )
     if not is_range:
         return Vary(key, tuple(dict.fromkeys(parts)), text)
-    if int(parts[2]) < 2 or float(parts[0]) == float(parts[1]):
+    if count < 2 or start == stop:
         raise InputError(f"--vary {text}: expected at least two values between two ends")
-    steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
+    steps = np.linspace(start, stop, count).tolist()
     # Whole numbers are written as such: a key may be an integer.
-    return Vary(key, tuple(repr(step).removesuffix(".0") for step in steps.tolist()), text)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
+    return Vary(key, tuple(repr(step).removesuffix(".0") for step in steps), text)
 
 
 def changed(scene: Scene, *overrides: str) -> Scene:

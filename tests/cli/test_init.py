@@ -11,7 +11,7 @@ from runs import ROOT, TWO_ARM, environment, refusal, run, shell, tomllib
 from scenes import put_at
 
 import dolfinopt
-from dolfinopt.cli.main import TEMPLATES
+from dolfinopt.cli.begin import TABLES
 from dolfinopt.data import template_folder
 from dolfinopt.dynamics.build import check_motion
 from dolfinopt.scene.load import read_scene
@@ -19,6 +19,7 @@ from dolfinopt.scene.messages import describe_keys, implausible
 from dolfinopt.scene.schema import scene_schema
 
 pytestmark = pytest.mark.serial  # nothing here knows of ranks
+TEMPLATES = TABLES["init"]["template"]["choices"]
 DEMOS = sorted((ROOT / "demos").glob("*.toml"))
 
 

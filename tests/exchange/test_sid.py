@@ -209,7 +209,7 @@ DAMAGED = {
     "coordinates": (bar([BLOCKS[0].replace("nq = 2", "nq = 3")]), ["nq = 2 of mdCM, not 3"]),
     "node without phi": (bar(nodal=NODAL[1:]), ["'phi' of node 17 before", "end node"]),
     "node without a name": (edited("=       17", "="), ["line 11", "a name of its own"]),
-    "no modal": (" part\n end part\n", ["line 2", "'new modal'"]),
+    "no modal": (" part\n end part\n", ["line 2", "'modal'"]),
 }
 
 

@@ -99,7 +99,7 @@ def test_ctrl_c_ends_the_import_before_it_writes(tmp_path, monkeypatch):
     """Libraries that swallow KeyboardInterrupt never see one; afterwards all is as before."""
     handlers = [signal.default_int_handler]
     monkeypatch.setattr(
-        "dolfinopt.exchange.urdf.file.read_robot",
+        "dolfinopt.cli.robots.read_robot",
         lambda *of: handlers.append(signal.getsignal(signal.SIGINT)) or read_robot(*of),
     )
     before = signal.signal(signal.SIGINT, handlers[0])

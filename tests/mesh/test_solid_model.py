@@ -228,7 +228,7 @@ def walled(**keys):
     "changes, words",
     [
         (("arms.link1.wall=0.002",), ("wall", "0.002", "only with hollow")),
-        (("arms.link1.hollow=true",), ("wall", "number > 0")),
+        (("arms.link1.hollow=true",), ("arms.1.wall", "a value with hollow = true")),
         ((*HOLLOW, "arms.link1.max_wall=0.01"), ("max_wall", "0.01", "less than half")),
         ((*HOLLOW, "arms.link1.min_wall=0.005"), ("min_wall", "less than max_wall")),
         ((*HOLLOW, "arms.link1.min_wall=0.003"), ("wall", "0.002", "min_wall = 0.003")),

@@ -265,7 +265,7 @@ def test_changed_table_is_read_anew(tmp_path):
     after = end_points(rigid_motion(DENSE, of), of)
     assert_close([before[-1], after[-1]], [[0.5, 0.0], [0.5, 0.3]], 1e-14)
     file.unlink()
-    with refused("points.csv", "no such file"):
+    with refused("points.csv", "No such file"):
         rigid_motion(DENSE, of)
 
 

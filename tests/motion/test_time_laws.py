@@ -10,7 +10,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.motion.build import breakpoints, desired_path, rigid_motion
 from dolfinopt.motion.paths import curve_by_chord, curve_in_time
 from dolfinopt.scene.csv_table import Table, read_table
-from dolfinopt.scene.laws import Limits, ShapedLaw, law_for
+from dolfinopt.scene.laws import Limits, law_for, shaped
 from dolfinopt.scene.load import read_scene, scene_from_dict
 
 pytestmark = pytest.mark.serial  # one rank shows all there is
@@ -46,7 +46,8 @@ def peaks(law, duration, length):
 
 def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives():
     """(4 u (1 - u))^3 leaves place, speed and acceleration at the ends; by Gauss' rule."""
-    law, duration = ShapedLaw(law_of("quintic"), (0.1, -0.2, 0.15)), 0.7
+    base, duration = law_of("quintic"), 0.7
+    law = shaped(base, (0.1, -0.2, 0.15))
     ends = law(np.array([0.0, duration]), duration)
     assert_close(ends[0], [0.0, 1.0], 1e-14)
     assert_close(np.array(ends[1:]), np.zeros((2, 2)), 1e-12)
@@ -58,7 +59,7 @@ def test_shaped_law_rests_at_both_ends_and_its_rates_are_its_derivatives():
     )
     for order in (0, 1):
         assert_close(there[order], [0.25 * weights @ law(t, duration)[order + 1]], 1e-13, 1.0)
-    assert abs(law(np.array([0.2]), duration)[0] - law.base(np.array([0.2]), duration)[0]) > 0.01
+    assert abs(law(np.array([0.2]), duration)[0] - base(np.array([0.2]), duration)[0]) > 0.01
 
 
 def test_peaks_in_closed_form():
@@ -252,8 +253,8 @@ def test_bad_table(tmp_path, text, words):
 
 def test_file_that_cannot_be_read(tmp_path):
     for file, reason in (
-        (str(tmp_path), "is a directory"),
-        (str(tmp_path / "absent.csv"), "no such file"),
+        (str(tmp_path), "Is a directory"),
+        (str(tmp_path / "absent.csv"), "No such file"),
     ):
         refusal(lambda: read_table(file, ("x", "y")), reason, "a table (CSV)")  # noqa: B023
     with pytest.raises(InputError, match="not a file name"):

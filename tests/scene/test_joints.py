@@ -110,7 +110,7 @@ REFUSED = [
     (("joints", 1, "name"), "yaw", "joints.1.name", "a name that no other joint has"),
     (("joints", 1, "name"), "t", "joints.1.name", 'a column "t" means the time'),
     (("joints", 1, "axis"), [0, 0, 0], "joints.1.axis", "not of length zero"),
-    (("joints", 1, "axis"), None, "joints.1.axis", "three numbers with a prismatic joint"),
+    (("joints", 1, "axis"), None, "joints.1.axis", 'with type = "prismatic"'),
     (("joints", 1, "type"), "fixed", "joints.1", 'with type = "fixed"'),
     (("joints", 1, "type"), "ball", "joints.1.type", '"revolute" | "prismatic" | "fixed"'),
     (("joints", 1, "position_limits"), [0.2, 0.1], "joints.1.position_limits", "the least first"),

@@ -52,8 +52,7 @@ if TYPE_CHECKING:
 
 # -- inertia of rigid bodies in space, as URDF states it -----------------------------------------
 
-Product = Annotated[float, Field(ge=-1e9, le=1e9)]
-Tensor = Six[Product]  # xx, yy, zz, xy, xz, yz
+Tensor = Six[Annotated[float, Field(ge=-1e9, le=1e9)]]  # xx, yy, zz, xy, xz, yz
 # By how much, over the largest, rounded moments may miss the triangle inequality.
 ROUNDED = 1e-6
 
@@ -97,7 +96,6 @@ SHORTEST = 1e-6  # m
 MAX_CELLS = 100_000  # along one direction: far beyond use, stops a typing error before the mesher
 SECTIONS = ("box", "tube")
 SectionOrFile = Annotated[str, NAMES_FILE, Field(json_schema_extra={"examples": list(SECTIONS)})]
-WallThickness = Annotated[float, Field(ge=1e-6, le=1e3)]  # m
 WALL_KEYS = ("wall", "min_wall", "max_wall")
 # Points round a hollow arm's section: with more, a factor's band would be too wide.
 MOST_AROUND = 150
@@ -167,9 +165,9 @@ class Arm(Drive):
     passive: Extent | None = None
     symmetric: bool | Literal["z", "yz", "extruded", "y-extruded"] = False
     hollow: bool | SectionOrFile = False
-    wall: WallThickness | None = None
-    min_wall: WallThickness | None = None
-    max_wall: WallThickness | None = None
+    wall: Length | None = None
+    min_wall: Length | None = None
+    max_wall: Length | None = None
     design: str | None = None
     rigid: bool = False
     mass: Inertia | None = None
@@ -209,14 +207,14 @@ class Arm(Drive):
             )
 
     def _check_thickness(self) -> None:
-        if isinstance(self.symmetric, str) and not self.is_solid:
-            raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", "symmetric")
-        if self.extruded and self.cells is None:
-            raise Refusal("expected only with cells = [nx, ny, nz]", "symmetric", "mesh")
+        plane = isinstance(self.symmetric, str) and not self.is_solid
+        expected = "expected only with a solid arm, cells = [nx, ny, nz]"
+        if plane or (self.extruded and self.cells is None):
+            raise Refusal(expected, "symmetric", "mesh")
         for number, region in enumerate(self.regions):
             key = f"regions.{number}.depth"
             if region.depth is not None and not self.is_solid:
-                raise Refusal("expected only with a solid arm, cells = [nx, ny, nz]", key)
+                raise Refusal(expected, key)
             if region.depth is not None and self.extruded:
                 raise Refusal(
                     f'expected none with symmetric = "{self.symmetric}": the design is the same '
@@ -235,12 +233,7 @@ class Arm(Drive):
                 "hollow",
                 *(["mesh"] if self.mesh is not None else []),
             )
-        if self.wall is None:
-            raise Refusal(
-                "expected a number > 0 [m], the wall's initial thickness, with hollow = true",
-                "wall",
-                "hollow",
-            )
+        self.need("wall", "hollow")
         if self.extruded:
             raise Refusal("expected another value with hollow = true", "symmetric", "hollow")
         for key in ("regions", "interfaces"):

@@ -121,27 +121,10 @@ class Use(NamedTuple):
         return f"used only with {self.choice}" + f" = {values}" * bool(values)
 
 
-class ByDimension(NamedTuple):
-    """Keys of a table, separated by spaces, on which the machine's dimension has a say.
-
-    Attributes:
-        in_plane: have an effect in the plane alone.
-        in_space: have one with [[joints]] alone.
-        numbers: in the plane a number.
-        vectors: a number for every direction.
-    """
-
-    in_plane: str = ""
-    in_space: str = ""
-    numbers: str = ""
-    vectors: str = ""
-
-
 class Table(BaseModel):
     """Base of all tables of the scene: frozen, no unknown key, no silent conversion."""
 
     USES: ClassVar[tuple[Use, ...]] = ()
-    BY_DIMENSION: ClassVar[ByDimension]
 
     @classmethod
     def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
@@ -155,7 +138,6 @@ class Table(BaseModel):
             for keys, (choice, *values) in USES.get(cls.__name__, {}).items()
         ]
         cls.USES = (*cls.USES, *uses)
-        cls.BY_DIMENSION = ByDimension(**DIMENSIONS.get(cls.__name__, {}))
         for use in uses:
             for key in use.keys.split():
                 field = cls.model_fields[key]
@@ -220,17 +202,18 @@ class Table(BaseModel):
 
     def _check_dimension(self, scene: Scene) -> None:
         """Refuse keys, and shapes of values, that the machine has no use for."""
-        spatial, keys = scene.is_spatial, self.BY_DIMENSION
+        spatial = scene.is_spatial
+        said = {key: x.split() for key, x in DIMENSIONS.get(type(self).__name__, {}).items()}
         where = "with [[joints]]: the machine moves in space"
         if not spatial:
             where = "without [[joints]]: the machine moves in the plane"
-        for key in (keys.in_plane if spatial else keys.in_space).split():
+        for key in said.get("in_plane" if spatial else "in_space", ()):
             self.refuse_stated(f".{key}", where, "joints")
-        for key in keys.numbers.split():
+        for key in said.get("numbers", ()):
             if isinstance(getattr(self, key), tuple) and not spatial:
                 raise Refusal(f"expected a number {where}", f".{key}")
         numbers = "three numbers" if spatial else "two numbers"
-        for key in keys.vectors.split():
+        for key in said.get("vectors", ()):
             value = getattr(self, key)
             if value != type(self).model_fields[key].default and len(value) != scene.dimension:
                 raise Refusal(f"expected an array of {numbers} {where}", f".{key}")
@@ -255,6 +238,13 @@ class Table(BaseModel):
         Raises:
             Refusal: they do not.
         """
+
+    def need(self, key: str, choice: str) -> None:
+        """Raise if a key has no value that another one's asks for."""
+        if getattr(self, key, None) is None:
+            meaning = type(self).model_fields[key].description
+            reason = f"expected a value with {choice} = {shown(getattr(self, choice))}"
+            raise Refusal(f"{reason}: {meaning}", key, choice)
 
     def refuse_stated(self, key: str, reason: str, *others: str) -> None:
         """Raise if a key, of any path, has not its default; `reason` goes on after it."""

@@ -127,8 +127,7 @@ class Design(Table):
         )
         thin, wide = min(self.least_widths), max(self.least_widths)
         if wide > max(ratio, 1.0) * thin * (1.0 + 1e-9):
-            wider = "minimum_member" if self.minimum_member > self.minimum_gap else "minimum_gap"
-            other = "minimum_gap" if wider == "minimum_member" else "minimum_member"
+            other, wider = sorted(("minimum_gap", "minimum_member"), key=vars(self).__getitem__)
             raise Refusal(
                 f"expected at most {ratio * thin:.4g} [m], {ratio:.3g} times {other} = {thin}, "
                 f"with erosion = {self.erosion}; lower erosion or widen the other",
@@ -159,10 +158,9 @@ class Design(Table):
 
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse what the arms, their cells and their solid ends cannot meet."""
-        if not scene.cell_counts:  # nothing to design
-            return
-        self._check_hollow(scene)
-        self._check_member_width(scene)
+        if scene.cell_counts:  # there is something to design
+            self._check_hollow(scene)
+            self._check_member_width(scene)
 
     def _check_hollow(self, scene: Scene) -> None:
         """Refuse what walls have no use for."""
@@ -222,10 +220,11 @@ class Region(Table):
     def check_table(self) -> None:
         if (self.box is None) == (self.circle is None):
             raise Refusal(
-                "expected one of box = [x0, y0, x1, y1] and circle = [x, y, radius] "
-                f"{'beside' if self.box is None else 'alone, not both, beside'} kind",
+                "expected one of box = [x0, y0, x1, y1] and circle = [x, y, radius] beside kind, "
+                "not both",
                 "kind",
-                *([] if self.box is None else ["box", "circle"]),
+                "box",
+                "circle",
             )
         if self.box is not None and not (self.box[0] < self.box[2] and self.box[1] < self.box[3]):
             raise Refusal("expected [x0, y0, x1, y1] with x0 < x1 and y0 < y1 [m]", "box")
@@ -290,11 +289,7 @@ class Optimizer(Table):
 # -- [part]: what `dolfinopt part` makes of a result, unless its options say otherwise ----------
 
 
-MAX_STARTS = 100
-
-
 STEPS = 80  # of the curves, unless stated
-OptimizerSteps = Annotated[int, Field(ge=1, le=MAX_ITERATIONS)]
 
 
 class Part(Table):
@@ -303,8 +298,8 @@ class Part(Table):
     tool_radius: Extent | None = None
     tolerance: Length | None = None
     minimum_member: Length | None = None
-    optimize: bool | OptimizerSteps = False
-    starts: int = Field(default=0, ge=0, le=MAX_STARTS)
+    optimize: bool | Annotated[int, Field(ge=1, le=MAX_ITERATIONS)] = False
+    starts: int = Field(default=0, ge=0, le=100)
 
     @property
     def iterations(self) -> int:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -30,7 +28,6 @@ if TYPE_CHECKING:
 
 INBOARD, OUTBOARD = "inboard", "outboard"
 Point = Three[Position]
-Vector = Three[float]
 Components = TypeVar("Components", bound=tuple[float, ...])
 
 
@@ -39,9 +36,6 @@ def check_direction(axis: Components) -> Components:
     if math.hypot(*axis) < 1e-9:
         raise Refusal("expected a direction, not of length zero")
     return axis
-
-
-Axis = Annotated[Vector, AfterValidator(check_direction)]
 
 
 def _check_name(name: str) -> str:
@@ -57,7 +51,7 @@ class Interface(Table):
     name: Annotated[str, AfterValidator(_check_name)]
     point: Point
     radius: Length | None = None
-    axis: Axis | None = None
+    axis: Annotated[Three[float], AfterValidator(check_direction)] | None = None
 
     @property
     def is_end(self) -> str:
@@ -248,6 +242,19 @@ class Drive(Table):
                     "bearing_stiffness",
                 )
 
+    @property
+    def bearing(self) -> tuple[Six[Stiffness], Six[Stiffness]] | None:
+        """Springs of the bearing, 0 where it is rigid, and dampers; None: it is rigid."""
+        if self.bearing_stiffness is None or not any(self.bearing_stiffness):
+            return None
+        return self.bearing_stiffness, self.bearing_damping or (0.0,) * 6
+
+    @property
+    def friction_law(self) -> Three[float] | None:
+        """Viscous and Coulomb friction, and the speed that smooths it; None without."""
+        given = self.friction or ()
+        return (*given, self.friction_speed) if any(given) else None
+
     def check_plane_bearing(self) -> None:
         """Refuse springs of a bearing in directions that the plane does not have."""
         for i, direction in OUT_OF_PLANE.items():
@@ -263,34 +270,17 @@ DRIVE_KEYS = tuple(Drive.model_fields)
 OF_BEARINGS = ("bearing_stiffness", "bearing_damping")  # which fixed joints have, too
 
 
-@dataclass(frozen=True)
-class JointParts:
-    """What an arm's inboard joint consists of, wherever the scene states it.
-
-    Attributes:
-        stiffness, damping: of the gear, as the joint feels it; 0: it is rigid.
-        rotor: the rotor's inertia about its own axis, kg m2.
-        ratio: its turns for one of the joint, rad/m of a prismatic one.
-        bearing: springs of the bearing (6,), 0 where it is rigid, and dampers (6,); None: rigid.
-        friction: viscous, Coulomb, and the speed that smooths it; None without.
-    """
-
-    stiffness: float
-    damping: float
-    rotor: float
-    ratio: float
-    bearing: tuple[Six[Stiffness], Six[Stiffness]] | None
-    friction: Three[float] | None
-
-
 def stated_at(table: Any, key: str) -> bool:
     """Return whether an arm or a joint states a key of its drive, bearing or friction."""
     return getattr(table, key) not in (None, 0.0, type(table).model_fields[key].default)
 
 
-def _part(arm: Arm, joint: Joint | None, key: str) -> Any:
-    """Return a part of the joint that holds an arm: the joint's own, or else that of the arm."""
-    return getattr(joint if joint is not None and stated_at(joint, key) else arm, key)
+def drive_of(arm: Arm, joint: Joint | None) -> Drive:
+    """Return the drive of the joint that holds an arm: the joint's own keys, or else the arm's."""
+    own = {key for key in DRIVE_KEYS if joint is not None and stated_at(joint, key)}
+    return Drive.model_construct(
+        **{key: getattr(joint if key in own else arm, key) for key in DRIVE_KEYS}
+    )
 
 
 def check_motor(scene: Scene, index: int) -> None:
@@ -298,7 +288,8 @@ def check_motor(scene: Scene, index: int) -> None:
     arm, at = scene.arms[index], ""
     held = [(k, item) for k, item in enumerate(scene.joints) if item.child == arm.name]
     joint = held[0][1] if held else None
-    if _part(arm, joint, "rotor_inertia") and _part(arm, joint, "gear_ratio") is None:
+    drive = drive_of(arm, joint)
+    if drive.rotor_inertia and drive.gear_ratio is None:
         if joint is not None and stated_at(joint, "rotor_inertia"):
             at = f"joints.{held[0][0]}"
         raise Refusal(
@@ -322,7 +313,7 @@ def check_motor(scene: Scene, index: int) -> None:
 def _check_in_space(arm: Arm, index: int, number: int, joint: Joint) -> None:
     """Refuse parts of a joint that arm and joint state, or that it cannot have."""
     own = f"joints.{number}"
-    if joint.passive and _part(arm, joint, "gear_stiffness"):
+    if joint.passive and drive_of(arm, joint).gear_stiffness:
         raise Refusal(
             f"expected 0: the joint {joint.name} has passive = true and no motor behind a spring",
             f"{own if joint.gear_stiffness else ''}.gear_stiffness",
@@ -346,18 +337,7 @@ def _check_in_space(arm: Arm, index: int, number: int, joint: Joint) -> None:
             )
 
 
-def joint_parts(scene: Scene) -> tuple[JointParts, ...]:
-    """Return the parts of every arm's inboard joint, in the arms' order."""
+def joint_drives(scene: Scene) -> tuple[Drive, ...]:
+    """Return the drive of every arm's inboard joint, in the arms' order."""
     joints = {joint.child: joint for joint in scene.joints}
-    parts = []
-    for arm in scene.arms:
-        part = partial(_part, arm, joints.get(arm.name))
-        bearing = friction = None
-        if any(part("bearing_stiffness") or ()):
-            bearing = part("bearing_stiffness"), part("bearing_damping") or (0.0,) * 6
-        if any(part("friction") or ()):
-            friction = (*part("friction"), part("friction_speed"))
-        gear = part("gear_stiffness"), part("gear_damping")
-        motor = part("rotor_inertia"), part("gear_ratio") or 1.0
-        parts.append(JointParts(*gear, *motor, bearing, friction))
-    return tuple(parts)
+    return tuple(drive_of(arm, joints.get(arm.name)) for arm in scene.arms)

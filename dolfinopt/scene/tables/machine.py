@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import takewhile
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import AfterValidator, Field, field_validator
@@ -33,7 +32,7 @@ from dolfinopt.scene.tables.joints import (
     check_direction,
     check_site,
     check_used,
-    joint_parts,
+    joint_drives,
     place_of,
     site_of,
 )
@@ -85,45 +84,35 @@ class Joint(Drive):
         if self.position_limits is not None and self.position_limits[0] > self.position_limits[1]:
             raise Refusal("expected the least first, then the largest", "position_limits")
         super().check_table()
-        if self.axis is None and self.moves:
-            raise Refusal(
-                f"expected an array of three numbers with a {self.type} joint", "axis", "type"
-            )
+        if self.moves:
+            self.need("axis", "type")
 
     def check_in_scene(self, scene: Scene) -> None:
-        """Refuse names that are unknown; with the last joint, all that joints rule out.
-
-        Raises:
-            Refusal: its keys are paths from the scene.
-        """
-        before = list(takewhile(lambda joint: joint is not self, scene.joints))
+        """Refuse names that are unknown."""
         names = [arm.name for arm in scene.arms]
         if self.child not in names:
             allowed = " | ".join(map(shown, names))
             raise Refusal(f"expected the name of an arm: {allowed}", ".child")
         check_site(scene, self.parent, ".parent", (GROUND,))
-        for other in before:
-            if other.child == self.child:
-                raise Refusal(
-                    f"expected an arm that no other joint holds: {self.child} hangs on "
-                    f"{other.name}; a joint that closes a loop is one of [[closures]]",
-                    ".child",
-                )
-        if len(before) == len(scene.joints) - 1:
-            _check_tree(scene)
-            _check_machine(scene)
 
 
-def _check_tree(scene: Scene) -> None:
-    """Refuse arms without a joint, joints that do not lead to the ground or that nothing moves."""
-    parents = {joint.child: joint.parent_arm for joint in scene.joints}
+def check_tree(scene: Scene) -> None:
+    """Refuse arms not held by one joint, joints off the ground or that nothing moves."""
+    holding: dict[str, Joint] = {}
+    for i, joint in enumerate(scene.joints):
+        if (other := holding.setdefault(joint.child, joint)) is not joint:
+            raise Refusal(
+                f"expected an arm that no other joint holds: {joint.child} hangs on "
+                f"{other.name}; a joint that closes a loop is one of [[closures]]",
+                f"joints.{i}.child",
+            )
     for k, arm in enumerate(scene.arms):
         if arm.name == GROUND:
             raise Refusal(
                 'expected another name: with [[joints]] "ground" is what the machine stands on',
                 f"arms.{k}.name",
             )
-        if arm.name not in parents:
+        if arm.name not in holding:
             raise Refusal(
                 "expected one of [[joints]] whose child it is", f"arms.{k}.name", "joints"
             )
@@ -134,7 +123,7 @@ def _check_tree(scene: Scene) -> None:
         passed, above = [joint.child], joint.parent_arm
         while above != GROUND and above not in passed:
             passed.append(above)
-            above = parents[above]
+            above = holding[above].parent_arm
         if above != GROUND:
             raise Refusal(
                 f"expected a tree that stands on the ground: from {joint.child} its parents lead "
@@ -145,7 +134,7 @@ def _check_tree(scene: Scene) -> None:
         raise Refusal('expected a "revolute" or "prismatic" joint: nothing moves', "joints.0.type")
 
 
-def _check_machine(scene: Scene) -> None:
+def check_machine(scene: Scene) -> None:
     """Refuse what only a machine in the plane has, or what has no equations in space yet."""
     motion = scene.motion
     if motion.path not in PATHS:
@@ -174,7 +163,6 @@ def _check_machine(scene: Scene) -> None:
 # -- `[[closures]]`: joints that close loops between arms, or with the ground ---------------------
 
 Line = tuple[Component, Component]
-ClosureKind = Literal["ball", "pin", "slider", "universal", "rod"]
 # Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
 OF_THE_END = ("deviation", "settling")
 # What is positive of every equation's force and moment, in the joint's frame; in the plane and in
@@ -194,7 +182,7 @@ class Closures(Table):
     """A joint between an arm's interface and another one or the ground that closes a loop."""
 
     name: Annotated[str, AfterValidator(check_joint_name)]
-    kind: ClosureKind
+    kind: Literal["ball", "pin", "slider", "universal", "rod"]
     between: tuple[str, str]
     point: TwoOrThree[Position] = (0.0, 0.0, 0.0)
     rpy: Three[Angle] = (0.0, 0.0, 0.0)
@@ -227,9 +215,7 @@ class Closures(Table):
     def check_table(self) -> None:
         needed = {"slider": ("axis",), "universal": ("axis", "cross_axis")}
         for key in needed.get(self.kind, ()):
-            if getattr(self, key) is None:
-                reason = f"expected an array of three numbers with a {self.kind}"
-                raise Refusal(reason, key, "kind")
+            self.need(key, "kind")
         if self.kind != "universal":
             return
         assert self.axis is not None and self.cross_axis is not None
@@ -241,7 +227,10 @@ class Closures(Table):
         """Refuse names that are taken or unknown, and what a loop cannot be combined with."""
         if self.name.casefold() in [joint.name.casefold() for joint in scene.joints]:
             raise Refusal("expected a name that no joint or other closure has", ".name")
-        self._check_ends(scene)
+        check_site(scene, self.between[0], ".between")
+        check_site(scene, self.between[1], ".between", (GROUND,))
+        if site_of(self.between[0])[0] == site_of(self.between[1])[0]:
+            raise Refusal("expected interfaces of two arms", ".between")
         if scene.is_spatial:
             self._check_in_space(scene)
         else:
@@ -345,22 +334,14 @@ class Closures(Table):
                 ".kind",
             )
 
-    def _check_ends(self, scene: Scene) -> None:
-        check_site(scene, self.between[0], ".between")
-        check_site(scene, self.between[1], ".between", (GROUND,))
-        if site_of(self.between[0])[0] == site_of(self.between[1])[0]:
-            raise Refusal("expected interfaces of two arms", ".between")
-
 
 # -- `[control]` ---------------------------------------------------------------------------------
-
-Known = Literal["rigid", "elastic", "tip", "none"]
 
 
 class Control(Table):
     """Feed-forward and feedback that drive the rigid coordinates instead of prescribing them."""
 
-    feed_forward: Known = "rigid"
+    feed_forward: Literal["rigid", "elastic", "tip", "none"] = "rigid"
     stiffness: tuple[Stiffness, ...]
     damping: tuple[Stiffness, ...]
     limits: tuple[DriveForce, ...] | None = None
@@ -368,9 +349,8 @@ class Control(Table):
 
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse gains and limits that are not one for every driven coordinate."""
-        if self.feed_forward == "elastic" and not any(
-            part.stiffness for part in joint_parts(scene)
-        ):
+        soft = any(drive.gear_stiffness for drive in joint_drives(scene))
+        if self.feed_forward == "elastic" and not soft:
             raise Refusal(
                 'expected "rigid": no joint has a gear that gives way; state gear_stiffness',
                 ".feed_forward",
@@ -465,8 +445,6 @@ class Payload(Table):
 
 ForceComponent = Annotated[float, Field(ge=-1e12, le=1e12)]  # N, N m
 Vector = TwoOrThree[ForceComponent]
-GivenMoment = ForceComponent | Three[ForceComponent]
-ForceFrame = Literal["world", "arm"]
 # Columns of a table besides t, by the machine's dimension.
 FORCE_COLUMNS = {2: ("fx", "fy", "mz"), 3: ("fx", "fy", "fz", "mx", "my", "mz")}
 
@@ -477,10 +455,10 @@ class Force(Table):
     name: Annotated[str, AfterValidator(check_joint_name)] | None = None
     arm: str
     force: Vector | None = None
-    moment: GivenMoment | None = None
+    moment: ForceComponent | Three[ForceComponent] | None = None
     table: FileName | None = None
     factor: float = Field(default=1.0, ge=-1e12, le=1e12)
-    frame: ForceFrame = "world"
+    frame: Literal["world", "arm"] = "world"
     feed_forward: bool = True
 
     def check_table(self) -> None:

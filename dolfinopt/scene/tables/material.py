@@ -20,17 +20,10 @@ from dolfinopt.scene.tables.base import (
 )
 
 YoungModulus = Annotated[float, Field(ge=1.0, le=1e15)]  # Pa
-PoissonRatio = Annotated[float, Field(ge=-0.99, lt=0.5)]
 # Of a direction across to one along the fibres: bounded by the ratio of their moduli alone.
 AnyRatio = Annotated[float, Field(ge=-100, le=100)]
-MassDensity = Annotated[float, Field(ge=1e-12, le=1e6)]  # kg/m3; 2.7e-9 t/mm3, too
-YieldStrength = Annotated[float, Field(ge=1e-3, le=1e15)]  # Pa
 FibreAngle = Annotated[float, Field(ge=-6.3, le=6.3)]  # rad
 Quantity = Annotated[float, Field(ge=-1e15, le=1e15)]  # a key of a law of one's own
-
-YoungModuli = YoungModulus | TwoOrThree[YoungModulus]
-ShearModuli = YoungModulus | Three[YoungModulus]
-PoissonRatios = PoissonRatio | AnyRatio | Three[AnyRatio]
 
 
 def check_material(name: str) -> str:
@@ -94,12 +87,12 @@ class Material(Table):
 
     name: CatalogueName | None = None
     kind: Literal["isotropic", "orthotropic"] = "isotropic"
-    young_modulus: YoungModuli
-    poisson_ratio: PoissonRatios
-    shear_modulus: ShearModuli | None = None
+    young_modulus: YoungModulus | TwoOrThree[YoungModulus]
+    poisson_ratio: Annotated[float, Field(ge=-0.99, lt=0.5)] | AnyRatio | Three[AnyRatio]
+    shear_modulus: YoungModulus | Three[YoungModulus] | None = None
     angle: FibreAngle | Three[FibreAngle] | None = None
-    density: MassDensity
-    yield_strength: YieldStrength | None = None
+    density: float = Field(ge=1e-12, le=1e6)  # kg/m3; 2.7e-9 t/mm3, too
+    yield_strength: float | None = Field(default=None, ge=1e-3, le=1e15)
 
     @property
     def law(self) -> LawDeclaration:
@@ -132,9 +125,8 @@ class Material(Table):
             given, optional = getattr(self, key, None) is not None, key not in OF_ALL
             if given and optional and key not in self.law.used:
                 raise Refusal(f"expected none {kind}", key, "kind")
-            if not given and (not optional or key in self.law.keys):
-                meaning = type(self).model_fields[key].description
-                raise Refusal(f"expected a value {kind}: {meaning}", key, "kind")
+            if not optional or key in self.law.keys:
+                self.need(key, "kind")
         if self.kind == "orthotropic":
             check_orthotropic(self, dim)
             return

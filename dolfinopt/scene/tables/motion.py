@@ -29,14 +29,9 @@ if TYPE_CHECKING:
     from dolfinopt.scene.tables.arms import Arm
 
 Point = TwoOrThree[Position]
-PathKind = Literal["arc", "line", "points", "joints", "rotation"]
-TimeLaw = Literal["quintic", "septic", "trapezoidal", "s-curve"]
-Base = Literal["cart", "fixed"] | Position
 Acceleration = Annotated[float, Field(ge=-1e5, le=1e5)]  # m/s2
-Gravity = TwoOrThree[Acceleration]
 SHAPE_LIMIT = 0.2  # of coefficients: shares of the way by which a law may run ahead
 MOST_COEFFICIENTS = 8
-ShapeCount = Annotated[int, Field(ge=0, le=MOST_COEFFICIENTS)]
 Coefficient = Annotated[float, Field(ge=-SHAPE_LIMIT, le=SHAPE_LIMIT)]
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 LIMITS = ("max_speed", "max_acceleration", "max_jerk")
@@ -46,7 +41,7 @@ PROFILES = ("trapezoidal", "s-curve")  # laws that are shaped by the limits
 class Motion(Table):
     """The prescribed motion of the end-effector and the mechanism that follows it."""
 
-    path: PathKind
+    path: Literal["arc", "line", "points", "joints", "rotation"]
     radius: Length = 1.0
     flattening: float = Field(default=1.0, ge=0, le=1)
     start: Point = (-1.0, 0.0)
@@ -55,8 +50,8 @@ class Motion(Table):
     initial_joints: tuple[Position, ...] | None = None
     file: FileName | None = None
     speed: float = Field(default=10.0, ge=-1e6, le=1e6)
-    law: TimeLaw = "quintic"
-    shape: ShapeCount | tuple[Coefficient, ...] = 0
+    law: Literal["quintic", "septic", "trapezoidal", "s-curve"] = "quintic"
+    shape: Annotated[int, Field(ge=0, le=MOST_COEFFICIENTS)] | tuple[Coefficient, ...] = 0
     acceleration_share: float = Field(default=0.25, ge=1e-3, le=0.5)
     max_speed: PathLimit | None = None
     max_acceleration: PathLimit | None = None
@@ -65,21 +60,16 @@ class Motion(Table):
     horizon: Duration = 3.0
     table_ends: Literal["rest", "moving"] = "rest"
     dwells: bool | tuple[tuple[Instant, Instant], ...] = True
-    base: Base = "cart"
+    base: Literal["cart", "fixed"] | Position = "cart"
     cart_follow: float = Field(default=0.5, ge=-1e3, le=1e3)
     cart_mass: Inertia = 0.0
     joint_height: Position = -0.5
     elbow: Literal[-1, 1] = -1
-    gravity: Gravity = (0.0, 0.0)
+    gravity: TwoOrThree[Acceleration] = (0.0, 0.0)
 
     def check_table(self) -> None:
-        tabulated = self.path in ("points", "joints")
-        if tabulated and self.file is None:
-            raise Refusal(
-                f'expected the path of a table (CSV) with motion.path = "{self.path}"',
-                "file",
-                "path",
-            )
+        if self.path in ("points", "joints"):
+            self.need("file", "path")
         if self.path == "line" and self.start == self.end:
             raise Refusal("expected another point than motion.start", "end", "start")
         if self.path == "rotation" and not self.is_fixed:
@@ -273,8 +263,9 @@ class Simulation(Table):
 
 SHIFTS, BAND = (0.0,), (0.0, 50.0)  # Hz; defaults
 ReductionMethod = Literal["craig-bampton", "modal", "krylov", "balanced"]
-ReductionError = Annotated[float, Field(ge=1e-6, le=0.5)]
-Coordinates = Annotated[int, Field(ge=1)] | ReductionError | Literal["auto"]
+Coordinates = (
+    Annotated[int, Field(ge=1)] | Annotated[float, Field(ge=1e-6, le=0.5)] | Literal["auto"]
+)
 
 
 class Reduction(Table):
@@ -294,18 +285,13 @@ class Reduction(Table):
         """Frequency band whose responses "balanced" weights, Hz."""
         return (self.frequencies[0], self.frequencies[-1]) if self.frequencies else BAND
 
-    def _check_frequencies(self) -> None:
-        given = self.frequencies
-        if given is None:
-            return
-        if self.method == "krylov" and (not given or len(set(given)) < len(given)):
-            raise Refusal("expected at least one number >= 0, none of them twice", "frequencies")
-        if self.method == "balanced" and (len(given) != 2 or given[0] >= given[1]):
-            raise Refusal("expected two frequencies, the lower one first", "frequencies")
-
     def check_table(self) -> None:
         """Refuse frequencies and numbers of coordinates that the method cannot have."""
-        self._check_frequencies()
+        given = self.frequencies
+        if given and self.method == "balanced" and (len(given) != 2 or given[0] >= given[1]):
+            raise Refusal("expected two frequencies, the lower one first", "frequencies")
+        if given is not None and (not given or len(set(given)) < len(given)):
+            raise Refusal("expected at least one number >= 0, none of them twice", "frequencies")
         if not self.count or self.count >= self.fewest:
             return
         what = "interface loads at each of reduction.frequencies"
@@ -345,13 +331,9 @@ class Reduction(Table):
         for i, arm in enumerate(scene.arms):
             least = self.fewest_of(arm)
             if arm.flexible and 0 < self.count < least and arm.is_solid:
-                has = "interface has six coordinates"
-                if arm.further_interfaces:
-                    has = (
-                        f"interfaces, {1 + len(arm.further_interfaces)}, have six coordinates each"
-                    )
                 raise Refusal(
-                    f"expected an integer >= {least} with a solid arm: its outboard {has}",
+                    f"expected an integer >= {least} with a solid arm: six coordinates for each of "
+                    f"its outboard interfaces, {1 + len(arm.further_interfaces)}",
                     "reduction.coordinates",
                     f"arms.{i}.cells",
                 )

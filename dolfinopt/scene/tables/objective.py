@@ -38,13 +38,7 @@ if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
     from dolfinopt.scene.tables.motion import Motion
 
-if TYPE_CHECKING:
-    ObjectiveKind = str
-else:  # the words of the responses that are declared
-    ObjectiveKind = Literal[tuple(objective_kinds())]
 GradientKind = Literal["esl", "exact"]
-Attached = Literal["rigid-body", "point-mass", "none"]
-Combination = Literal["sum", "worst"]
 MANY_CASES = 1000  # load cases that a motion may have however short it is
 Load = Three[float]  # F_x N, F_y N, moment N m
 SpatialLoad = Six[float]  # force N, moment N m
@@ -54,27 +48,25 @@ SPATIAL_LOADS: tuple[SpatialLoad, ...] = (
     (0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
     (0.0, 0.0, 0.0, 1.0, 0.0, 0.0),
 )
-ModeCount = Annotated[int, Field(ge=1, le=50)]
 TRACKED_AMONG = 6  # lowest modes: what becomes of the first one ends among them
-Weight = Annotated[float, Field(ge=0, le=1e9)]  # 1/N, 1/(N m)
 
 
 class Objective(Table):
     """What is minimised."""
 
-    kind: ObjectiveKind = "esl"
+    kind: str = "esl"  # of `objective_kinds`
     direction: Direction | None = None
     load_cases: int = Field(default=30, ge=1)
     gradient: GradientKind = "exact"
     exponent: float = Field(default=20.0, ge=2, le=200)
     stress_exponent: float = Field(default=4.0, ge=2, le=100)
     stress_margin: Extent = 0.0
-    scenarios: Combination = "sum"
+    scenarios: Literal["sum", "worst"] = "sum"
     loads: tuple[Load | SpatialLoad, ...] = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    effort_weights: tuple[Weight, ...] | None = None
-    attached: Attached = "rigid-body"
+    effort_weights: tuple[Annotated[float, Field(ge=0, le=1e9)], ...] | None = None
+    attached: Literal["rigid-body", "point-mass", "none"] = "rigid-body"
     elbow_angle: Angle | None = None
-    modes: ModeCount | Literal["first"] = 3
+    modes: Annotated[int, Field(ge=1, le=50)] | Literal["first"] = 3
 
     @property
     def follow(self) -> bool:
@@ -216,8 +208,11 @@ class Objective(Table):
 Limit = float | tuple[float | None, ...] | tuple[StiffnessCase, ...]
 
 
-class ConstraintOptions(Table):
-    """Options of limits."""
+OPTIONS = ("settling_after", "poles_at")  # keys that limit nothing themselves
+
+
+class Constraints(Table):
+    """Limits of a design besides its volume: true extremes, of the worst scenario."""
 
     settling_after: Instant = 0.0
     poles_at: tuple[Instant, ...] | None = None
@@ -225,8 +220,7 @@ class ConstraintOptions(Table):
     @property
     def limits(self) -> dict[str, Limit]:
         """What is limited, in the order of the keys."""
-        own = ConstraintOptions.model_fields
-        return {k: x for k, x in vars(self).items() if x is not None and k not in own}
+        return {k: x for k, x in vars(self).items() if x is not None and k not in OPTIONS}
 
     def limit(self, key: str) -> float | None:
         """Return the limit of a response that has one for all its values, None without one."""
@@ -310,10 +304,6 @@ class ConstraintOptions(Table):
                     ".settling_after",
                 )
 
-
-class Constraints(ConstraintOptions):
-    """Limits of a design besides its volume: true extremes, of the worst scenario."""
-
     @field_validator("peak_force", mode="before", check_fields=False)
     @classmethod
     def _leave_free(cls, value: Any) -> Any:
@@ -333,17 +323,17 @@ class Constraints(ConstraintOptions):
         return cases
 
 
-def _add_key(response: Declaration) -> None:
-    """Add the key that limits a response to `Constraints`, which is to be rebuilt."""
-    if response.limit and response.limit.stated:
-        field = FieldInfo(
-            default=None, description=response.limit.help, annotation=response.limit.type | None
-        )
-        Constraints.model_fields[response.key] = field
+def _add_keys() -> None:
+    """Let objective.kind name the responses, and [constraints] limit them; both to be rebuilt."""
+    Objective.model_fields["kind"].annotation = Literal[tuple(objective_kinds())]  # type: ignore
+    for response in DECLARED.values():
+        if response.limit and response.limit.stated:
+            Constraints.model_fields[response.key] = FieldInfo(
+                default=None, description=response.limit.help, annotation=response.limit.type | None
+            )
 
 
-for _response in DECLARED.values():
-    _add_key(_response)
+_add_keys()
 
 
 def declare(response: Declaration) -> None:
@@ -351,8 +341,7 @@ def declare(response: Declaration) -> None:
     from dolfinopt.scene.schema import Scene
 
     DECLARED[response.name] = response
-    Objective.model_fields["kind"].annotation = Literal[tuple(objective_kinds())]  # type: ignore
-    _add_key(response)
+    _add_keys()
     for table in (Objective, Constraints, Scene):
         table.model_rebuild(force=True)
 
@@ -369,33 +358,18 @@ class Scenario(Table):
     changes: tuple[str, ...]
     weight: float = Field(default=1.0, ge=1e-9, le=1e9)
 
-    @field_validator("changes")
-    @classmethod
-    def _check_changes(cls, changes: tuple[str, ...]) -> tuple[str, ...]:
-        for change in changes:
-            key = change.partition("=")[0].strip()
-            table = key.partition(".")[0]
-            if table not in (*TABLES, "closure"):  # an older word
-                raise Refusal(
-                    f"expected keys of {', '.join(TABLES[:-1])} or {TABLES[-1]}, found {shown(key)}"
-                )
-            if key == "material.poisson_ratio":
-                raise Refusal("expected no material.poisson_ratio: the reduced basis depends on it")
-            if key in ("material", "material.name"):
-                raise Refusal(
-                    "expected single values, e.g. material.young_modulus, not another material: "
-                    "the reduced basis depends on its Poisson's ratio"
-                )
-        return changes
-
     def check_in_scene(self, scene: Scene) -> None:
-        """Refuse changes of a material that are more than a factor of its stiffness."""
+        """Refuse changes of the arms, and of a material more than a factor of its stiffness."""
+        factors = [key for key in scene.scaling_keys if key != "thickness"]
         for change in self.changes:
-            table, _, key = change.partition("=")[0].strip().partition(".")
-            allowed = [name for name in scene.scaling_keys if name != "thickness"]
-            if table == "material" and key not in (*allowed, "yield_strength"):
+            key = change.partition("=")[0].strip()
+            table, _, name = key.partition(".")
+            if table not in (*TABLES, "closure"):  # an older word
+                known = f"{', '.join(TABLES[:-1])} or {TABLES[-1]}"
+                raise Refusal(f"expected keys of {known}, found {shown(key)}", ".changes")
+            if table == "material" and name not in (*factors, "yield_strength"):
                 raise Refusal(
-                    f"expected of the material {' or '.join(allowed)} alone: the reduced basis "
-                    "depends on the others",
+                    f"expected of the material {' or '.join(factors)} alone, not another material: "
+                    "the reduced basis depends on its Poisson's ratio and directions",
                     ".changes",
                 )
