@@ -298,7 +298,7 @@ def _robot_files(
         facets = surface @ frame[:3, :3].T + frame[:3, 3]
         files[mesh] = triangle_bytes(facets, f"{name}, m")
         links.append(NewLink(link, inertia, mesh))
-        said.append(f"{link}: {inertia.mass:.4g} kg, was {before[link].own.mass:.4g} kg")
+        said.append(f"{link}: {inertia.mass:.4g} kg, was {before[link].inertia.mass:.4g} kg")
     files[origin.file.name] = robot_text(origin.file, links, folder)
     said.append(f"the robot with these links: {folder / origin.file.name}")
     return files, said

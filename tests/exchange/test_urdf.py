@@ -172,7 +172,7 @@ def test_the_start_weighs_what_the_file_says(tmp_path):
     start = uniform_design(scene, partition, arms, scene.design.initial)
     found = sum(scene.material_of(k).density * arm.mesh.area @ start[k] for k, arm in arms.items())
     robot = read_robot(DEMO)
-    expected = sum(robot.links[name].own.mass for name in ("upper_arm", "forearm"))
+    expected = sum(robot.links[name].inertia.mass for name in ("upper_arm", "forearm"))
     assert found == pytest.approx(expected, rel=0.01)  # of the filter's ends
     fractions = [arm.volume_fraction(start[k]) for k, arm in arms.items()]
     assert np.mean(fractions) == pytest.approx(scene.design.volume_fraction, rel=0.01)

@@ -20,7 +20,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from dolfinopt.exchange.urdf.robot import CELLS, FEWEST, SceneBody, inverse
-from dolfinopt.mesh.solid_cells import boundary
+from dolfinopt.mesh.checks import corner_jacobians
+from dolfinopt.mesh.solid_cells import TENSOR, boundary
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -44,11 +45,8 @@ PATCH = 0.04  # share of the outer facets that are an interface where the link i
 LONGEST = 0.9  # of the side of a cell: move of a corner
 EASED = 0.85  # share of a move that is left where it spoils a cell, again and again
 LEAST = 0.15  # of a cube's: Jacobian at a corner of a cell whose corners were moved
-# Corners of a cube in the order of Gmsh's hexahedron.
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0],
-                    [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # fmt: skip
-# Neighbours of every corner of a cube, right-handed.
-AROUND = ((1, 3, 4), (2, 0, 5), (3, 1, 6), (0, 2, 7), (7, 5, 0), (4, 6, 1), (5, 7, 2), (6, 4, 3))
+ORDER = TENSOR[8, 3]  # from Gmsh's hexahedron to DOLFINx's, and back
+CORNERS = np.indices((2, 2, 2)).reshape(3, 8)[::-1].T[ORDER]  # of a cube, in Gmsh's order
 
 
 class NoSolid(ValueError):
@@ -77,7 +75,7 @@ class LinkCells:
     @property
     def volume(self) -> float:
         """Volume of the cells, m3."""
-        return float(_jacobians(self.points[self.cells]).mean(axis=1).sum())
+        return float(_jacobians(self.points, self.cells).mean(axis=1).sum())
 
     @property
     def extents(self) -> np.ndarray:
@@ -86,11 +84,10 @@ class LinkCells:
 
     def ends_within(self, distance: float) -> float:
         """Return the volume of the cells whose middle is nearer to an interface, m3."""
-        corners = self.points[self.cells]
         facets = self.points[np.concatenate([self.inboard, self.outboard])]
         places = np.concatenate([facets.reshape(-1, 3), facets.mean(axis=1)])
-        near = cKDTree(places).query(corners.mean(axis=1))[0] < distance
-        return float(_jacobians(corners[near]).mean(axis=1).sum())
+        near = cKDTree(places).query(self.points[self.cells].mean(axis=1))[0] < distance
+        return float(_jacobians(self.points, self.cells[near]).mean(axis=1).sum())
 
     def offset(self, length: float) -> float:
         """Largest distance of an interface's middle from its joint, m."""
@@ -472,13 +469,12 @@ def _on_surface(
     longest = np.linalg.norm(shift, axis=1, keepdims=True)
     shift *= np.minimum(1.0, LONGEST * side / np.maximum(longest, 1e-30))
     tries = 0
-    while (bad := _jacobians((points + shift)[cells]).min(axis=1) < LEAST * side**3).any():
+    while (bad := _jacobians(points + shift, cells).min(axis=1) < LEAST * side**3).any():
         shift[np.unique(cells[bad])] *= EASED if tries < 20 else 0.0
         tries += 1
     return np.asarray(points + shift)
 
 
-def _jacobians(corners: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (n, 8) at the corners of hexahedra (n, 8, 3), m3."""
-    a, b, c = (corners[:, list(corner)] - corners for corner in zip(*AROUND, strict=True))
-    return np.asarray(np.einsum("nka,nka->nk", a, np.cross(b, c)))
+def _jacobians(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Return the Jacobians (n, 8) at the corners of hexahedra, m3."""
+    return corner_jacobians(points[cells[:, ORDER]])
