@@ -20,7 +20,7 @@ from dolfinopt.dynamics.collocation import Strategy
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.state import Memory
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
-from dolfinopt.parallel import Partition, gather_cells, on_root, together
+from dolfinopt.parallel import Partition, gather_tables, on_root, together
 from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import DIGEST, flattened, program, with_digests
@@ -84,7 +84,7 @@ def save(
     folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm], memory: Memory
 ) -> None:
     """Replace the checkpoint atomically (collective)."""
-    arrays = _of_arms(partition, arms, memory, len(scene.arms) + 1)
+    arrays = _of_arms(partition, arms, memory)
     with together(partition.world):
         if partition.world.rank == 0:
             _sealed(folder, {**_stamp(scene), **arrays, **_of_run(memory)})
@@ -208,27 +208,23 @@ def unpickled(data: np.ndarray, classes: Mapping[str, Sequence[str]]) -> Any:
 
 
 def _of_arms(
-    partition: Partition, arms: Mapping[int, Arm], memory: Memory, number: int
+    partition: Partition, arms: Mapping[int, Arm], memory: Memory
 ) -> dict[str, np.ndarray]:
-    """Return cells, nodes and `number` sets of modes of whole arms, on the root (collective)."""
+    """Return cells, nodes and modes of whole arms, on the root (collective)."""
     with together(partition.world):
-        own = {k: _of_arm(arm, k, memory, number) for k, arm in arms.items()}
-    names = ["centroid", "points", "cells"]
-    names += [f"{part}{j}" for j in range(number) for part in ("modes", "outboard")]
-    arrays: dict[str, np.ndarray] = {}
-    for name in names:
-        columns = gather_cells(partition, {k: x[name] for k, x in own.items() if name in x})
-        arrays |= {f"arm{k}/{name}": column for k, column in columns.items()}
-    return arrays
+        own = {k: _of_arm(arm, k, memory) for k, arm in arms.items()}
+    tables = gather_tables(partition, own)
+    return {f"arm{k}/{name}": x for k, table in tables.items() for name, x in table.items()}
 
 
-def _of_arm(arm: Arm, index: int, memory: Memory, number: int) -> dict[str, np.ndarray]:
+def _of_arm(arm: Arm, index: int, memory: Memory) -> dict[str, np.ndarray]:
     """Return this rank's rows of one arm's arrays."""
     arrays = {"centroid": arm.mesh.centroid, "points": _interior_points(arm)}
     if index in memory.cells:  # an arm that repeats another's design has no variables
         arrays["cells"] = memory.cells[index]
-    for j in range(number):
-        arrays[f"modes{j}"], arrays[f"outboard{j}"] = _rows(arm, memory.modes[index], j)
+    inner = arm.substructure.T.num_interior
+    for j, modes in enumerate(memory.modes[index]):
+        arrays[f"modes{j}"], arrays[f"outboard{j}"] = modes[:inner], modes[inner:]
     return arrays
 
 
@@ -254,13 +250,6 @@ def _modes(arrays: Mapping[str, np.ndarray], index: int, arm: Arm) -> list[np.nd
         interior, outboard = (arrays[f"arm{index}/{part}{j}"] for part in ("modes", "outboard"))
         modes.append(np.vstack([interior[rows], outboard if is_last else outboard[:0]]))
     return modes
-
-
-def _rows(arm: Arm, modes: Sequence[np.ndarray], j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interior rows of the j-th modes and those of the outboard interface, if any."""
-    inner = arm.substructure.T.num_interior
-    own = modes[j] if j < len(modes) else np.empty((inner, 0))
-    return own[:inner], own[inner:]
 
 
 def _interior_points(arm: Arm) -> np.ndarray:

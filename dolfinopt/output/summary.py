@@ -28,7 +28,7 @@ from dolfinopt.output.feed_forward import comparison_of, lead_warnings, summary_
 from dolfinopt.output.joint_limits import joint_limits
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import UNITS, drive_units, free_drives, trajectory_units
-from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
+from dolfinopt.parallel import Partition, gather_arms, gather_tables, together
 from dolfinopt.profiling import Counts
 from dolfinopt.responses.constraints import limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
@@ -419,7 +419,8 @@ def _widths(
 ) -> dict[int, Widths]:
     """Return the widths of member and gap of the designs cut at one half; on the root."""
     # Of solid arms where the scene asks for a width: voxels take seconds.
-    corners, solid, fixed, asked = {}, {}, {}, {}
+    mine: dict[int, dict[str, np.ndarray]] = {}
+    asked = {}
     with together(partition.world):
         for k, arm in arms.items():
             mesh, design = arm.mesh, arm.scene.design
@@ -428,12 +429,11 @@ def _widths(
             points = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
             if arm.scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
                 points = _lowest(mesh.comm, points)
-            corners[k], solid[k], fixed[k] = points, x_phys[k] > SOLID, mesh.fixed
+            mine[k] = {"corners": points, "solid": x_phys[k] > SOLID, "fixed": mesh.fixed}
             asked[k] = max(design.least_widths)
-    cells, cut, stays = (gather_cells(partition, item) for item in (corners, solid, fixed))
-    asked = gather_arms(partition, asked)
+    tables, asked = gather_tables(partition, mine), gather_arms(partition, asked)
     with together(partition.world):
-        return {k: widths_of(cells[k], cut[k], stays[k], asked[k]) for k in cells}
+        return {k: widths_of(**table, asked=asked[k]) for k, table in tables.items()}
 
 
 def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:
