@@ -19,11 +19,12 @@ from dolfinopt.plots.poses import Poses
 from dolfinopt.plots.style import (
     COLOURS,
     DENSITY,
+    FRAME,
     GREY,
     ORANGE,
     SOLID_FROM,
-    framed_axes,
     mixed,
+    stacked_axes,
 )
 
 BASE = "#c9c9c9"  # carts, pedestals and sliders
@@ -54,7 +55,7 @@ class PlaneStage:
         self.stands = np.ptp(poses.held[:, 0], axis=0).max() == 0.0
         points = np.concatenate([poses.reached(views), *paths])
         low, high = points.min(axis=0) - ROOM * size, points.max(axis=0) + ROOM * size
-        self.figure, self.axes, _ = framed_axes(low, high, title, SIDES)
+        self.figure, (self.axes,) = stacked_axes([(low, high)], title, sides=SIDES, **FRAME)
         self.axes.set(xlabel="x [m]", ylabel="y [m]")
         self.axes.grid(True, alpha=0.3)
         bar = self.axes.inset_axes((1.02, 0.0, 0.025, 1.0))

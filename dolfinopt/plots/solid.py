@@ -75,13 +75,15 @@ class Studio:
     """Solids in front of a camera, rendered off-screen, with no word in the picture.
 
     Attributes:
-        low, high: (2,) what of the camera's plane is seen, m.
+        axes: that show the camera's plane, m, to one scale.
         back: (3,) unit vector towards the viewer.
         plotter: PyVista's; holds the solids.
     """
 
-    def __init__(self, camera: Camera, low: np.ndarray, high: np.ndarray, px_per_m: float) -> None:
-        self.low, self.high, self.back = low, high, camera.back
+    def __init__(self, camera: Camera, axes: Axes) -> None:
+        self.axes, self.back = axes, camera.back
+        low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+        px_per_m = axes.bbox.width / (high - low)[0]
         size = [int(np.ceil(n)) for n in (high - low) * px_per_m]
         theme = pyvista.themes.DocumentTheme()
         theme.multi_samples = 4  # eight double the time of the software renderer
@@ -142,10 +144,10 @@ class Studio:
         finally:
             self.plotter.close()
 
-    def show(self, axes: Axes, image: np.ndarray) -> Any:
-        """Put a picture into axes; return Matplotlib's image."""
-        extent = (self.low[0], self.high[0], self.low[1], self.high[1])
-        return axes.imshow(image, extent=extent, interpolation="antialiased", aspect="auto")
+    def show(self, image: np.ndarray) -> Any:
+        """Put a picture into the axes; return Matplotlib's image."""
+        extent = (*self.axes.get_xlim(), *self.axes.get_ylim())
+        return self.axes.imshow(image, extent=extent, interpolation="antialiased", aspect="auto")
 
 
 def material(view: ArmView, *, modes: bool = False) -> Surface:
@@ -245,17 +247,14 @@ def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: 
         edges: whether the box is drawn.
         look: colours, see `Studio.solid`.
     """
-    limits = (*axes.get_xlim(), *axes.get_ylim())
-    scale = axes.bbox.width / (limits[1] - limits[0])  # px per m
-    studio = Studio(LINKS, *_seen(box), scale)
+    studio = Studio(LINKS, axes)
     studio.solid(surface, **look)
     if edges:
         lines = pyvista.Box([value for pair in zip(*box) for value in pair])
         studio.plotter.add_mesh(lines, style="wireframe", color=GREY, lighting=False, **PLAIN)
-    studio.show(axes, studio.close())
-    axes.axis(limits)
+    studio.show(studio.close())
     axes.set_axis_off()
-    (low, high), px = box, 1.0 / scale
+    (low, high), px = box, float(np.ptp(axes.get_xlim())) / axes.bbox.width  # m
     corner = LINKS.plane(np.array([low[0], low[1], high[2]]))  # at the front, below
     draw_length(axes, corner - [0.0, 30.0 * px], round_number(0.2 * (high - low)[0]), 8.0 * px)
     draw_triad(axes, LINKS, corner + np.array([-42.0, 24.0]) * px, 26.0 * px)

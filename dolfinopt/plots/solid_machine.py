@@ -21,7 +21,7 @@ from dolfinopt.plots.solid import (
     draw_triad,
     material,
 )
-from dolfinopt.plots.style import DPI, ORANGE, framed_axes, mixed, round_number
+from dolfinopt.plots.style import FRAME, ORANGE, mixed, round_number, stacked_axes
 
 ELEVATION = np.radians(25.0)  # of the viewer
 AZIMUTHS = np.radians(np.arange(-75.0, 270.0, 30.0))
@@ -56,15 +56,15 @@ class SolidStage:
         ends += [self.flat(foot) + PLATE * self.size * np.array([[-1.0, -1.0], [1.0, 1.0]])]
         flat = np.concatenate(ends)
         low, high = flat.min(axis=0) - ROOM * self.size, flat.max(axis=0) + ROOM * self.size
-        self.figure, self.axes, scale = framed_axes(low, high, title, SIDES)
+        self.figure, (self.axes,) = stacked_axes([(low, high)], title, sides=SIDES, **FRAME)
         self.axes.set_axis_off()
         self._draw_ruler(low, high - low)
-        self.studio = Studio(self.camera, low, high, scale * DPI)
+        self.studio = Studio(self.camera, self.axes)
         plate = np.stack([foot - ROD * self.size * self.up, foot])
         self.studio.bar(plate, PLATE * self.size, "#e4e4e4")
         for place in poses.origin[0, [parent == GROUND for parent in poses.parents]]:
             self.studio.bar(np.stack([foot, place]), 2.0 * ROD * self.size)
-        self.image = self.studio.show(self.axes, self.studio.render())
+        self.image = self.studio.show(self.studio.render())
         self.keep()
 
     def _foot(self) -> np.ndarray:
