@@ -32,6 +32,8 @@ VOXELS = 1e7  # of a link, at most
 MANY = 300  # pieces of a surface from which on it is filled as it is, not piece by piece
 TINY = 0.02  # of the link's size: smaller pieces (screws, labels) are left out
 SHELL = 128  # voxels along a link on which open pieces are filled
+# Of a filled shell smoothed over a voxel: half a voxel within it, where the surface is on average.
+SURFACE = 0.69
 GAP = 0.02  # of the link's size: half of the widest gap that a closing bridges
 SHORTEST = 0.4  # of the distance between the joints that the geometry must bridge to be cut there
 MARGIN = 0.03  # of that distance, which is cut off where the geometry ends before a joint
@@ -97,41 +99,11 @@ class LinkCells:
         return float(np.linalg.norm(middles, axis=1).max())
 
 
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Voxels: the middle of voxel (i, j, k) is low + (i + 1/2, j + 1/2, k + 1/2) step."""
+def _image(shape: tuple[int, ...], step: float, first: np.ndarray) -> Any:
+    """Return PyVista's image whose points are the middles of voxels, the first one at `first`."""
+    import pyvista
 
-    low: np.ndarray
-    step: float
-    shape: tuple[int, int, int]
-
-    @property
-    def image(self) -> Any:
-        """PyVista's image whose points are the middles."""
-        import pyvista
-
-        return pyvista.ImageData(
-            dimensions=self.shape,
-            spacing=(self.step,) * 3,
-            origin=[float(x) + 0.5 * self.step for x in self.low],
-        )
-
-    def filled_by(self, closed: Trimesh) -> np.ndarray:
-        """Return True for the voxels whose middle lies within a closed surface."""
-        import pyvista
-
-        surface = pyvista.wrap(closed)
-        result = surface.voxelize_binary_mask(reference_volume=self.image)["mask"]
-        return np.asarray(result).reshape(self.shape, order="F") > 0
-
-    def passed_by(self, surface: Trimesh) -> np.ndarray:
-        """Return True for the voxels that a surface passes."""
-        fine: Any = surface.subdivide_to_size(0.5 * self.step, max_iter=20)
-        inside = np.floor((fine.vertices - self.low) / self.step).astype(int)
-        inside = inside[((inside >= 0) & (inside < self.shape)).all(axis=1)]
-        result = np.zeros(self.shape, dtype=bool)
-        result[tuple(inside.T)] = True
-        return result
+    return pyvista.ImageData(dimensions=shape, spacing=(step,) * 3, origin=first)
 
 
 def _nearest_places(solid: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -147,24 +119,19 @@ def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]
     """Return the closed surface of what open pieces enclose, together with closed ones; or none."""
     import trimesh
 
-    corners = np.vstack([piece.bounds for piece in (*left, *closed)])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    step, radius = float((high - low).max()) / SHELL, round(GAP * SHELL)
-    margin = (radius + 2) * step  # a closing needs it, and an opening
-    along, over, through = map(int, np.ceil((high - low + 2.0 * margin) / step))
-    grid = _Grid(low - margin, step, (along, over, through))
-    shell = np.zeros(grid.shape, dtype=bool)
-    for piece in (*closed, *left):
-        shell |= grid.passed_by(piece)
+    whole: Any = trimesh.util.concatenate([*closed, *left])
+    step, radius = float(np.ptp(whole.bounds, axis=0).max()) / SHELL, round(GAP * SHELL)
+    grid, margin = whole.voxelized(step, max_iter=20), radius + 2  # for closing and opening
+    shell = np.pad(grid.matrix, margin)
     shell = ndimage.binary_dilation(shell, iterations=radius)
     shell = ndimage.binary_fill_holes(shell)
     shell = ndimage.binary_erosion(shell, iterations=radius)
     shell = ndimage.binary_opening(shell, iterations=1)  # a sheet encloses nothing
     if not shell.any():
         return []
-    image = grid.image
+    image = _image(shell.shape, step, grid.translation - margin * step)
     image["inside"] = ndimage.gaussian_filter(shell.astype(float), 1.0).ravel(order="F")
-    surface = image.contour([0.5], "inside")
+    surface = image.contour([SURFACE], "inside")
     result = trimesh.Trimesh(surface.points, surface.regular_faces)
     _turn_outwards(result)
     return [result]
@@ -395,6 +362,8 @@ def _cells(
     length: float,
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
+    import pyvista
+
     low, high = piece.bounds.copy()
     side = min(side, float((high - low)[1:].min()) / FEWEST)
     if ends is not None:
@@ -404,9 +373,10 @@ def _cells(
     start = 0.5 * (low + high) - 0.5 * blocks * side
     if blocks.prod() * FINE**3 > VOXELS:
         return None
-    along, over, through = (int(FINE * n) for n in blocks)
-    fine = _Grid(start, side / FINE, (along, over, through))
-    region = fine.filled_by(piece)
+    step, shape = side / FINE, tuple(map(int, FINE * blocks))
+    image = _image(shape, step, start + 0.5 * step)
+    mask = pyvista.wrap(piece).voxelize_binary_mask(reference_volume=image)["mask"]
+    region = np.reshape(mask, shape, order="F") > 0
     pooled = region.reshape(blocks[0], FINE, blocks[1], FINE, blocks[2], FINE).mean(axis=(1, 3, 5))
     if not (pooled >= FULL).any():
         return None
