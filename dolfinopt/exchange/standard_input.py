@@ -365,26 +365,24 @@ def _misplaced(first: sid.Node, tips: Sequence[sid.Node], dimension: int) -> Ite
     length = np.abs(last.origin.M0).max()
     if not length > 0.0:
         yield f"the outboard node {last.name} is at the origin"
-    push, turn = np.abs(last.phi.M0).max(), np.abs(last.psi.M0).max()
-    # Of the two scales the other follows over the arm's length.
-    push, turn = max(push, length * turn), max(turn, push / length)
-    checks = [
-        (first, "origin", first.origin.M0, length, "at the origin"),
-        (first, "phi", first.phi.M0, push, "held in the frame"),
-        (first, "psi", first.psi.M0, turn, "held in the frame"),
-    ]
+    # The largest displacement by a coordinate, of the interface or by its rotation over the length.
+    moved = max(np.abs(last.phi.M0).max(), length * np.abs(last.psi.M0).max())
+    scales = {"origin": length, "phi": moved, "psi": moved / length}
+    checks = [(first, name, getattr(first, name).M0, scale) for name, scale in scales.items()]
     if dimension == 2:
+        across = {"origin": [2], "phi": [2], "psi": [0, 1]}
         checks += [
-            (last, "origin", last.origin.M0[2], length, "in the plane z = 0"),
-            (last, "phi", last.phi.M0[2], push, "in the plane"),
-            (last, "psi", last.psi.M0[:2], turn, "in the plane"),
+            (last, name, getattr(last, name).M0[across[name]], scales[name]) for name in across
         ]
-    checks += [(node, "AP", node.AP.M0 - ONE, 1.0, "parallel") for node in (first, *tips)]
-    for node, name, values, scale, must in checks:
+    checks += [(node, "AP", node.AP.M0 - ONE, 1.0) for node in (first, *tips)]
+    for node, name, values, scale in checks:
+        which, must = "outboard", "in the plane z = 0"
+        if node is first:
+            which, must = "inboard", "at the origin and held in the frame"
         if (off := np.abs(values).max()) > FILE_ROUNDING_SHARE * scale:
             yield (
-                f"{name} of node {node.name} deviates by {off:.3g}; the "
-                f"{'inboard' if node is first else 'outboard'} node must be {must}"
+                f"{name} of node {node.name} deviates by {off:.3g}; the {which} node must be "
+                f"{'parallel to the frame' if name == 'AP' else must}"
             )
 
 
