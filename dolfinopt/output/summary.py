@@ -475,14 +475,11 @@ def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> Iterato
         contacts, arm = trait.contacts, scene.arms[k]
         if not contacts.count:
             continue
-        kinds = {"corner": contacts.corners, "edge": contacts.edges}
-        counts = [f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in kinds.items() if n]
-        pieces = "1 piece" if contacts.pieces == 1 else f"{contacts.pieces} pieces"
         place = ", ".join(f"{x:.4g}" for x in contacts.places[0])
         text = (
-            f"cut at a density of 0.5, arm {arm.name!r} is {pieces} that touch in "
-            f"{' and '.join(counts)} of cells alone, the worst at ({place}) m: such contacts are "
-            "stiff in the model, and no joints in a workshop"
+            f"cut at a density of 0.5, cells of arm {arm.name!r} meet in {contacts.corners} "
+            f"corners and {contacts.edges} edges alone (pieces: {contacts.pieces}), the worst at "
+            f"({place}) m: such contacts are stiff in the model, and no joints in a workshop"
         )
         if rated and run.crisp is not None:
             text += f"; crisp leaves them out, and {100.0 * contacts.left_out:.2g} % of the solid"
@@ -507,8 +504,7 @@ def _against_contacts(scene: Scene, index: int, size: float) -> str:
         wider = max(least, radius + 0.5 * size)
         key = "a larger design.minimum_member"
         result.append(key if design.controls_widths else f"design.filter_radius = {wider:.4g}")
-    *rest, last = result
-    return f"set {', '.join(rest)}{' and ' if rest else ''}{last}, or use finer cells"
+    return f"set {', '.join(result)}, or use finer cells"
 
 
 def _large_deflections(scene: Scene, evaluation: Evaluation) -> Iterator[str]:
