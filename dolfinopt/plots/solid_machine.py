@@ -167,10 +167,9 @@ def camera_of(poses: Poses, up: np.ndarray) -> Camera:
     """Return the view in which the machine's places spread most."""
     east, north = np.roll(np.eye(3), -1 - int(np.argmax(np.abs(up))), axis=0)[:2]
     points = np.concatenate([poses.origin, poses.outboard], axis=1).reshape(-1, 3)
-    cameras, spreads = [], []
-    for azimuth in AZIMUTHS:
-        level = np.cos(azimuth) * east + np.sin(azimuth) * north
-        cameras.append(camera_from(np.cos(ELEVATION) * level + np.sin(ELEVATION) * up, up))
-        spreads.append(float(np.linalg.det(np.cov(cameras[-1].plane(points).T))))
+    levels = np.outer(np.cos(AZIMUTHS), east) + np.outer(np.sin(AZIMUTHS), north)
+    backs = np.cos(ELEVATION) * levels + np.sin(ELEVATION) * up
+    cameras = [camera_from(back, up) for back in backs]
+    spreads = np.linalg.det([np.cov(camera.plane(points).T) for camera in cameras])
     # Of views that spread alike the first.
-    return cameras[int(np.argmax(np.array(spreads) > (1.0 - 1e-9) * max(spreads)))]
+    return cameras[int(np.argmax(spreads > (1.0 - 1e-9) * spreads.max()))]
