@@ -34,8 +34,6 @@ if TYPE_CHECKING:
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
 Colour = str | tuple[float, float, float]
-# Where lights are, from the camera's point of view, and how strong.
-LIGHTS = (((0.35, 0.75, 1.0), 0.75), ((-0.6, 0.1, 0.8), 0.3))
 EDGE = 35.0  # degrees between faces from which an edge stays sharp
 SHADED = {"smooth_shading": True, "split_sharp_edges": True, "feature_angle": EDGE, "ambient": 0.3,
           "diffuse": 0.85, "specular": 0.1}  # fmt: skip
@@ -87,12 +85,7 @@ class Studio:
         size = [int(np.ceil(n)) for n in (high - low) * px_per_m]
         theme = pyvista.themes.DocumentTheme()
         theme.multi_samples = 4  # eight double the time of the software renderer
-        self.plotter: Any = pyvista.Plotter(
-            off_screen=True, window_size=size, theme=theme, lighting="none"
-        )
-        for place, strength in LIGHTS:
-            light = pyvista.Light(position=place, light_type="camera light", intensity=strength)
-            self.plotter.add_light(light)
+        self.plotter: Any = pyvista.Plotter(off_screen=True, window_size=size, theme=theme)
         focus = 0.5 * (low + high) @ np.stack([camera.right, camera.up])
         seen = self.plotter.camera
         seen.focal_point, seen.position, seen.up = focus, focus + camera.back, camera.up
