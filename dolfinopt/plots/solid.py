@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
 Colour = str | tuple[float, float, float]
+SIDES = 60  # of a round bar
 EDGE = 35.0  # degrees between faces from which an edge stays sharp
 SHADED = {"smooth_shading": True, "split_sharp_edges": True, "feature_angle": EDGE, "ambient": 0.3,
           "diffuse": 0.85, "specular": 0.1}  # fmt: skip
@@ -101,8 +102,7 @@ class Studio:
         if len(surface.triangles):
             mesh = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
             if "scalars" in look:
-                mesh.cell_data["values"] = look.pop("scalars")
-                look |= {"scalars": "values", "ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
+                look |= {"ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
             self.add(mesh, **look)
 
     def line(self, points: np.ndarray, colour: Colour, width: float = 1.0) -> None:
@@ -113,12 +113,8 @@ class Studio:
 
     def bar(self, ends: np.ndarray, radius: float, colour: Colour = BAR) -> None:
         """Draw a round bar between two points (2, 3), m; nothing where they coincide."""
-        along = ends[1] - ends[0]
-        if (length := float(np.linalg.norm(along))) > 1e-9:
-            mesh: Any = pyvista.Cylinder(
-                center=ends.mean(axis=0), direction=along / length, radius=radius, height=length
-            )
-            self.add(mesh.triangulate(), color=colour)
+        if not np.allclose(*ends):
+            self.add(pyvista.Line(*ends).tube(radius=radius, n_sides=SIDES), color=colour)
 
     def ball(self, centre: np.ndarray, radius: float, colour: Colour) -> None:
         """Draw a sphere."""
