@@ -239,7 +239,7 @@ def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: 
     studio = Studio(LINKS, axes)
     studio.solid(surface, **look)
     if edges:
-        lines = pyvista.Box([value for pair in zip(*box) for value in pair])
+        lines = pyvista.Box(np.transpose(box).ravel())
         studio.plotter.add_mesh(lines, style="wireframe", color=GREY, lighting=False, **PLAIN)
     studio.show(studio.close())
     axes.set_axis_off()

@@ -8,7 +8,6 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +30,8 @@ from dolfinopt.scene.tables.arms import tensor_problem
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
+# What trimesh logs is not printed: errors are told in one line.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 SECTIONS = 64  # flat sides of a cylinder
 # Of shapes: attributes, with as many numbers as each has.
 SIZES = {
@@ -65,22 +66,9 @@ def read_robot(file: Path) -> Robot:
         _check_names(file, kind, [item.get("name", "") for item in items])
     joints = [_joint(file, item) for item in elements["joint"]]
     _check_mimics(file, joints)
-    with _quiet():
-        links = {item.get("name"): _link(file, item) for item in elements["link"]}
+    links = {item.get("name"): _link(file, item) for item in elements["link"]}
     first, ordered = _ordered(file, list(links), joints)
     return Robot(root.get("name") or file.stem, file, links, ordered, first)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what trimesh logs to itself: errors are told in one line."""
-    logger = logging.getLogger("trimesh")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 def safe_xml(file: Path) -> Any:
@@ -277,8 +265,7 @@ def _link(file: Path, xml: Any) -> RobotLink:
     shapes, missing = _shapes(file, collisions or visuals)
 
     def visual() -> tuple[Trimesh, ...]:
-        with _quiet():
-            return _shapes(file, visuals)[0]
+        return _shapes(file, visuals)[0]
 
     return RobotLink(name, inertia, shapes, missing, visual if collisions and visuals else None)
 
