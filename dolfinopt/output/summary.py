@@ -427,21 +427,22 @@ def _widths(
             if mesh.dim == 3 and not design.controls_widths:
                 continue
             points = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
+            table = {"corners": points, "solid": x_phys[k] > SOLID, "fixed": mesh.fixed}
             if arm.scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
-                points = _lowest(mesh.comm, points)
-            mine[k] = {"corners": points, "solid": x_phys[k] > SOLID, "fixed": mesh.fixed}
+                table["corners"] = points[:, :4, :2]
+                lowest = _lowest(mesh.comm, points[:, :4, 2], arm.scene.arms[k].thickness)
+                table = {name: values[lowest] for name, values in table.items()}
+            mine[k] = table
             asked[k] = max(design.least_widths)
     tables, asked = gather_tables(partition, mine), gather_arms(partition, asked)
     with together(partition.world):
         return {k: widths_of(**table, asked=asked[k]) for k, table in tables.items()}
 
 
-def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:
-    """Return a box's cells' lower faces (n, 4, 2), m; nan above the lowest layer (collective)."""
-    low = comm.allreduce(points[:, :, 2].min(initial=np.inf), op=MPI.MIN)
-    high = comm.allreduce(points[:, :, 2].max(initial=-np.inf), op=MPI.MAX)
-    at = points[:, :4, 2].max(axis=1, initial=-np.inf) <= low + 1e-9 * (high - low)
-    return np.where(at[:, None, None], points[:, :4, :2], np.nan)
+def _lowest(comm: MPI.Comm, z: np.ndarray, thickness: float) -> np.ndarray:
+    """Return which cells' lower faces (n, 4), m, bound a box from below (collective)."""
+    low = comm.allreduce(z.min(initial=np.inf), op=MPI.MIN)
+    return z.max(axis=1, initial=-np.inf) <= low + 1e-9 * thickness
 
 
 def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
