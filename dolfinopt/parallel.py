@@ -152,12 +152,20 @@ def gather_cells(partition: Partition, mine: Mapping[int, np.ndarray]) -> dict[i
     Returns:
         One array (n_cells, ...) an arm on the root, empty elsewhere.
     """
-    pieces_of_all = {}
-    for arm, values in mine.items():
-        pieces = partition.comm.gather(values, root=0)
+    tables = gather_tables(partition, {k: {"": values} for k, values in mine.items()})
+    return {k: table[""] for k, table in tables.items()}
+
+
+def gather_tables(
+    partition: Partition, mine: Mapping[int, Mapping[str, np.ndarray]]
+) -> dict[int, dict[str, np.ndarray]]:
+    """Collect several such arrays of every arm by their names, the same on all ranks of an arm."""
+    whole = {}
+    for arm, table in mine.items():
+        pieces = partition.comm.gather(table, root=0)
         if pieces is not None:
-            pieces_of_all[arm] = np.concatenate(pieces)
-    return gather_arms(partition, pieces_of_all)
+            whole[arm] = {name: np.concatenate([piece[name] for piece in pieces]) for name in table}
+    return gather_arms(partition, whole)
 
 
 # -- one ending for all ranks ------------------------------------------------------------------

@@ -242,7 +242,7 @@ PLACES = [
     (optimising, 0, run_folder, "append_history", 1),
     (optimising, 0, checkpoint, "write_arrays", 0),
     (optimising, 0, checkpoint, "write_arrays", 1),
-    (optimising, LONE, checkpoint, "_rows"),
+    (optimising, LONE, checkpoint, "_of_arm"),
     (resuming, LONE, checkpoint, "_match"),
     (writing, LONE, arm.Arm, "volume_fraction"),
     (writing, 0, design, "_views"),

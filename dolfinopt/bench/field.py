@@ -150,43 +150,30 @@ NUMBERS: dict[str, Callable[[SimulationResult], float]] = {
     "deviation": lambda result: result.max_deviation,
     "compliance": lambda result: result.compliance,
 }
-History = Callable[[SimulationResult, np.ndarray], np.ndarray]
 
 
-def _deviation(result: SimulationResult, t: np.ndarray) -> np.ndarray:
-    """Return the flexible less the rigid end-effector (n, d), m."""
-    return _trajectory(result).at(t).deviation
-
-
-def _tip(result: SimulationResult, t: np.ndarray) -> np.ndarray:
-    """Return the same in the frame of a single arm (n, 2): along and across, m."""
-    angle = _trajectory(result).at(t).q_r[:, -1]
-    turned = _deviation(result, t) @ [1.0, 1j] * np.exp(-1j * angle)
+def _tip(seen: Trajectory) -> np.ndarray:
+    """Return the deviation in the frame of a single arm (n, 2): along and across, m."""
+    turned = seen.deviation @ [1.0, 1j] * np.exp(-1j * seen.q_r[:, -1])
     return np.stack([turned.real, turned.imag], axis=1)
 
 
-def _coordinate(name: str, order: int) -> History:
-    """Return the function to a rigid coordinate or its rate (n, 1)."""
-
-    def history(result: SimulationResult, t: np.ndarray) -> np.ndarray:
-        motion = _trajectory(result).at(t).motion
-        place = list(result.scene.rigid_units).index(name)
-        return (motion.q, motion.qd)[order][:, [place]]
-
-    return history
+def _column(seen: Trajectory, name: str, values: np.ndarray) -> np.ndarray:
+    """Return the column (n, 1) of a rigid coordinate."""
+    return values[:, [list(seen.scene.rigid_units).index(name)]]
 
 
-def _first_end(result: SimulationResult, t: np.ndarray) -> np.ndarray:
+def _first_end(seen: Trajectory) -> np.ndarray:
     """Return the place of the first arm's outboard interface across the plane x, y (n, 1), m."""
-    seen = _trajectory(result).at(t)
     return Posed(seen.mechanism, seen.q_r, seen.q_e).interface(0, 0)[0][2][:, None]
 
 
-HISTORIES: dict[str, History] = {
-    "deviation over time": _deviation,
+# By name: what returns values (n, k) of a motion at instants of a table.
+HISTORIES: dict[str, Callable[[Trajectory], np.ndarray]] = {
+    "deviation over time": lambda seen: seen.deviation,
     "tip over time": _tip,
-    "slide over time": _coordinate("slide", 0),
-    "turning rate over time": _coordinate("turn", 1),
+    "slide over time": lambda seen: _column(seen, "slide", seen.motion.q),
+    "turning rate over time": lambda seen: _column(seen, "turn", seen.motion.qd),
     "first arm's end along z over time": _first_end,
 }
 
@@ -243,7 +230,7 @@ def _history(case: Case, asked: Value, result: SimulationResult) -> Checked:
     table = read_table(asked.table)
     known = table["t"] <= asked.until
     expected = np.stack([table[column] for column in asked.columns], axis=1)[known]
-    computed = HISTORIES[asked.quantity](result, table["t"][known])
+    computed = HISTORIES[asked.quantity](_trajectory(result).at(table["t"][known]))
     value, reference, error = (
         float(np.linalg.norm(x, axis=1).max()) for x in (computed, expected, computed - expected)
     )

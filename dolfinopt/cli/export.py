@@ -21,8 +21,8 @@ from dolfinopt.dynamics.build import check_instant
 from dolfinopt.dynamics.state_space import StateSpace
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.in_space import in_space, plate_moments
-from dolfinopt.exchange.mbdyn import write_fem
-from dolfinopt.exchange.standard_input import lumped_nodes, modal_element, to_sid
+from dolfinopt.exchange.mbdyn import lumped_nodes, modal_element, write_fem
+from dolfinopt.exchange.standard_input import to_sid
 from dolfinopt.exchange.urdf.file import NewLink, read_robot, robot_text, sources_of
 from dolfinopt.exchange.urdf.robot import Inertia
 from dolfinopt.exchange.urdf.scene import Origin, read_origin
@@ -127,10 +127,10 @@ def _export_bodies(
         write_sid(folder / f"{arm.name}.sid", data)
         write_arrays(folder / f"{arm.name}.sid.npz", sid_arrays(data))
         write_fem(folder / f"{arm.name}.fem", element)
-        stiffness = ", geometric stiffness" if len(element.loads) else ""
+        stiffness = ", geometric stiffness" if element.stiffening else ""
         click.echo(
             f"{arm.name}: {data.mass:.6g} kg, {data.num_modes} coordinates, "
-            f"{len(element.labels)} nodes{stiffness}; in {folder / arm.name}.sid, .sid.npz, .fem"
+            f"{len(element.points)} nodes{stiffness}; in {folder / arm.name}.sid, .sid.npz, .fem"
         )
 
 
@@ -357,7 +357,7 @@ def _robot_files(
         facets = surface @ frame[:3, :3].T + frame[:3, 3]
         files[mesh] = triangle_bytes(facets, f"{name}, m")
         links.append(NewLink(link, inertia, mesh))
-        said.append(f"{link}: {inertia.mass:.4g} kg, was {before[link].own.mass:.4g} kg")
+        said.append(f"{link}: {inertia.mass:.4g} kg, was {before[link].inertia.mass:.4g} kg")
     files[origin.file.name] = robot_text(origin.file, links, folder)
     said.append(f"the robot with these links: {folder / origin.file.name}")
     return files, said

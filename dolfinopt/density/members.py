@@ -40,14 +40,11 @@ def widths_of(corners: np.ndarray, solid: np.ndarray, fixed: np.ndarray, asked: 
     """Return the widths of the thinnest member and of the thinnest gap of one arm.
 
     Args:
-        corners: (n_cells, c, d) of every cell in DOLFINx's order, m. Cells without corners (nan)
-            are left out.
+        corners: (n_cells, c, d) of every cell in DOLFINx's order, m.
         solid: (n_cells,) True where the cell is solid.
         fixed: (n_cells,) True where the scene says what the cell is.
         asked: the widest that was asked for, m; of gaps in space `WIDE` times that is looked at.
     """
-    known = np.isfinite(corners).all(axis=(1, 2))
-    corners, solid, fixed = corners[known], solid[known], fixed[known]
     middle = corners.mean(axis=1)
 
     def placed(width: Width | None) -> Width | None:

@@ -1,4 +1,4 @@
-"""Bodies as standard input data and back, and for MBDyn; see `dolfinopt.scene.sid`.
+"""Bodies as standard input data and back; see `dolfinopt.scene.sid`.
 
 With a frame that accelerates by a + A X, A = wd~ + w~ w~, all that the matrices of the elastic
 coordinates hold are sums of
@@ -26,30 +26,22 @@ the link, for zero as far as the rest of the file allows it: exact in the limit 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.errors import InputError
-from dolfinopt.exchange import mbdyn
-from dolfinopt.exchange.measured import (
-    CENTRIFUGAL_EXCESS_SHARE,
-    FILE_ROUNDING_SHARE,
-    SAME_NODE_SHARE,
-)
+from dolfinopt.exchange.measured import CENTRIFUGAL_EXCESS_SHARE, FILE_ROUNDING_SHARE
 from dolfinopt.multibody.rotations import ONE, PERMUTATION, skew
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, linear_part
 from dolfinopt.scene import sid
 
-if TYPE_CHECKING:
-    from dolfinopt.fem.elasticity import ElasticArm
-    from dolfinopt.reduction import Basis
-
-# Entries of J, and products of the angular velocity in the columns of Oe.
-INERTIA = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-PRODUCTS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
+# Rows and columns of the entries of J, and of the products of the angular velocity that Oe's
+# columns are of; how often a product stands in w w'.
+INERTIA = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
+PRODUCTS = (0, 1, 2, 0, 1, 0), (0, 1, 2, 1, 2, 2)
+TWICE = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
 
 Place = tuple[float, float, float]
 
@@ -71,8 +63,9 @@ def to_sid(body: ShapeIntegrals, comment: str = "") -> sid.StandardInputData:
     q = body.num_modes
     frequency = np.sqrt(np.diag(body.K) / np.diag(body.M)) / (2.0 * np.pi)
     held = _node("1", np.zeros(3), np.zeros((6, q)), np.zeros((0, q, q)))
-    interfaces = enumerate(outboard_interfaces(body), start=2)
-    tip, *further = (_node(str(k), *interface) for k, interface in interfaces)
+    each = (np.split(item, len(body.points)) for item in (body.outboard, body.K0_outboard))
+    interfaces = zip(count(2), body.points, *each)
+    tip, *further = (_node(str(number), *interface) for number, *interface in interfaces)
     return sid.StandardInputData(
         mass=body.mass,
         names=tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1)),
@@ -86,20 +79,10 @@ def to_sid(body: ShapeIntegrals, comment: str = "") -> sid.StandardInputData:
     )
 
 
-def outboard_interfaces(
-    body: ShapeIntegrals,
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield point (3,), modes (6, q) and K0 (6, q, q) or (0, q, q) of every outboard interface."""
-    for k, point in enumerate(body.points):
-        rows = slice(6 * k, 6 * k + 6)
-        yield point, body.outboard[rows], body.K0_outboard[rows]
-
-
 def _node(name: str, point: np.ndarray, modes: np.ndarray, K0: np.ndarray) -> sid.Node:
     """Return a node from its place, its displacements and rotations (6, q) and their K0."""
-    q = modes.shape[1]
-    phi, psi = modes[:3], modes[3:]
-    phi_q, psi_q = (_clean(-K0[:3]), _clean(-K0[3:])) if len(K0) else (None, None)
+    q, (phi, psi) = modes.shape[1], np.split(modes, 2)
+    phi_q, psi_q = np.split(_clean(-K0), 2) if len(K0) else (None, None)
     turn = _clean(skew(psi.T)).transpose(1, 0, 2)  # row, coordinate, column
     return sid.Node(
         name=name,
@@ -124,7 +107,7 @@ def _inertia_matrices(body: ShapeIntegrals) -> dict[str, sid.Taylor]:
     coriolis = np.einsum("abc,abkl->klc", -2.0 * PERMUTATION, W[:, :, 1:, 1:])
     result = {
         "mdCM": (body.w[:, :1], body.w[:, 1:, None]),
-        "J": (_moments(G)[:, None], _moments(G_q)[:, :, None]),
+        "J": (about(G)[INERTIA][:, None], about(G_q)[INERTIA][:, :, None]),
         "Ct": (body.w[:, 1:].T, push_q),
         "Cr": (turning(Y), turning(Y_q)),
         "Gr": (_gyroscopic(Y).reshape(3, 3 * q), _gyroscopic(Y_q).transpose(0, 2, 1, 3)),
@@ -147,10 +130,9 @@ def _clean(values: np.ndarray) -> np.ndarray:
     return values + 0.0
 
 
-def _moments(G: np.ndarray) -> np.ndarray:
-    """Return tr G 1 - G (3, 3, ...) as xx, yy, zz, xy, xz, yz (6, ...)."""
-    trace = np.einsum("aa...->...", G)
-    return np.stack([(a == b) * trace - G[a, b] for a, b in INERTIA])
+def about(Y: np.ndarray, share: float = 1.0) -> np.ndarray:
+    """Return tr Y 1 - Y (3, 3, ...): of int x x' the inertia; by half the trace back again."""
+    return share * np.einsum("cc...,ab->ab...", Y, ONE) - Y
 
 
 def turning(Y: np.ndarray) -> np.ndarray:
@@ -160,132 +142,13 @@ def turning(Y: np.ndarray) -> np.ndarray:
 
 def _gyroscopic(Y: np.ndarray) -> np.ndarray:
     """Return 2 (tr Y 1 - Y) with rows first and columns last."""
-    trace = np.einsum("aa...,ij->ij...", Y, ONE)
-    return np.moveaxis(2.0 * (trace - Y), 1, -1)
+    return np.moveaxis(2.0 * about(Y), 1, -1)
 
 
 def centrifugal(Y: np.ndarray) -> np.ndarray:
     """Return what w1^2, w2^2, w3^2, w1 w2, w2 w3, w1 w3 do (..., 6)."""
-    trace = np.einsum("aa...->...", Y)
-    columns = [Y[a, a] - trace if a == b else Y[a, b] + Y[b, a] for a, b in PRODUCTS]
-    return np.stack(columns, axis=-1)
-
-
-# -- to MBDyn's modal element, see `dolfinopt.exchange.mbdyn` -----------------------------------
-#
-# What couples modes and motion are, of a body in space, the invariants of its finite elements'
-# mass, and the nodes are its interfaces alone: the joint must not say `use invariant 9`. Of a plane
-# body they are the lumped masses of its mesh nodes, of which MBDyn makes its invariants; with
-# geometric stiffness the joint needs `use invariant 9`, for the -w^2 M q that stiffening outweighs.
-# Total mass, centre of mass and inertia (group 12), modal mass, stiffness and damping are the
-# consistent ones.
-
-
-@dataclass(frozen=True, eq=False)
-class LumpedNodes:
-    """A whole plane arm's mesh nodes in the order of their places, the same on any partition.
-
-    Attributes:
-        points: (n, 3) m.
-        masses: (n, 6) row sums of the mass matrix, kg, and t^2 / 12 of it about x and y, kg m2;
-            plane elements have no rotations.
-        modes: (n, 6, q).
-    """
-
-    points: np.ndarray
-    masses: np.ndarray
-    modes: np.ndarray
-
-
-def lumped_nodes(arm: ElasticArm, basis: Basis, thickness: float) -> LumpedNodes | None:
-    """Collect an arm's nodes on the first of its ranks (collective there); None elsewhere.
-
-    Args:
-        arm: in the plane, with its design set.
-        basis: of that design.
-        thickness: t, m.
-    """
-    rows = arm.mass_times(np.ones((len(arm.points), 2, 1)))[:, 0, 0]
-    pieces = arm.comm.gather((arm.points, rows, basis.V), root=0)
-    if pieces is None:
-        return None
-    places, rows, V = (np.concatenate(part) for part in zip(*pieces, strict=True))
-    rounded = np.round(places / (SAME_NODE_SHARE * np.ptp(places, axis=0).max())) + 0.0  # no -0
-    # Sorted by x, then y. Nodes that ranks share have several shares of mass and the same motion.
-    _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-    total = np.bincount(place.ravel(), weights=rows)
-    turning_mass = total * thickness**2 / 12.0
-    points, modes = np.zeros((len(kept), 3)), np.zeros((len(kept), 6, V.shape[2]))
-    points[:, :2], modes[:, :2] = places[kept], V[kept]
-    masses = np.stack([total, total, total, turning_mass, turning_mass, 0.0 * total], axis=1)
-    return LumpedNodes(points, masses, modes)
-
-
-def modal_element(body: ShapeIntegrals, nodes: LumpedNodes | None = None) -> mbdyn.ModalElement:
-    """Return the element: node 1 is the inboard joint, then the outboard interfaces, then `nodes`.
-
-    The interfaces are points without mass that move as the interfaces do.
-
-    Args:
-        body: reduced, in space; a plane one is brought there by `in_space`.
-        nodes: of a plane arm's mesh; None: with invariants instead.
-    """
-    q = body.num_modes
-    places, shapes, K0 = zip(*outboard_interfaces(body), strict=True)
-    points, modes = np.stack([np.zeros(3), *places]), np.stack([np.zeros((6, q)), *shapes])
-    lumped = None
-    if nodes is not None:
-        lumped = np.concatenate([np.zeros((len(points), 6)), nodes.masses])
-        points, modes = np.concatenate([points, nodes.points]), np.concatenate([modes, nodes.modes])
-    centre, inertia = body.inertia_about_centre()
-    loads, stiffening = _stiffening(body, np.concatenate(K0))
-    return mbdyn.ModalElement(
-        labels=tuple(str(k) for k in range(1, len(points) + 1)),
-        points=points,
-        modes=modes,
-        M=body.M,
-        K=body.K,
-        D=body.D,
-        lumped=lumped,
-        mass=body.mass,
-        centre=centre,
-        inertia=inertia,
-        loads=loads,
-        stiffening=stiffening,
-        invariants=_invariants(body) if nodes is None else None,
-    )
-
-
-def _invariants(body: ShapeIntegrals) -> mbdyn.Invariants:
-    q = body.num_modes
-    W = body.W.reshape(3, 3, 1 + q, 1 + q)
-    first, mixed = W[:, :, 0, 1:], W[:, :, 1:, 1:]  # int X_a Phi_b, int Phi_a Phi_b
-    return mbdyn.Invariants(
-        three=body.w[:, 1:],
-        four=np.einsum("cab,abj->cj", PERMUTATION, first),
-        five=np.einsum("cab,abjk->cjk", PERMUTATION, mixed),
-        eight=-_double_cross(first),
-        nine=_double_cross(mixed),
-    )
-
-
-def _double_cross(moments: np.ndarray) -> np.ndarray:
-    """Return int u~ v~ = int v u' - u . v of the integrals int u_a v_b (3, 3, ...)."""
-    trace = np.einsum("aa...,ij->ij...", moments, ONE)
-    return moments.swapaxes(0, 1) - trace
-
-
-def _stiffening(body: ShapeIntegrals, outboard: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return places (k,) and matrices (k, q, q) of group 19, without those that are zero."""
-    q = body.num_modes
-    if not body.is_stiffened:
-        return np.zeros(0, dtype=int), np.zeros((0, q, q))
-    rotation = body.K0[3:].reshape(3, 3, q, q)
-    inertial = [centrifugal(rotation), turning(rotation), body.K0[:3].transpose(1, 2, 0)]
-    matrices = [0.0 - np.moveaxis(item, -1, 0) for item in inertial]
-    result = np.concatenate([*matrices, outboard])
-    acting = result.any(axis=(1, 2))
-    return 1 + np.flatnonzero(acting), result[acting]
+    turned = about(0.5 * (Y + Y.swapaxes(0, 1)))
+    return np.moveaxis(-turned[PRODUCTS], 0, -1) * TWICE
 
 
 # -- from SID --------------------------------------------------------------------------------
@@ -313,17 +176,15 @@ def load_body(
     body = from_sid(sid.read_sid(path), dimension, tuple(further), str(path))
     if length is None:
         return body
-    axis: Place = (length, 0.0, 0.0)
-    wanted = [axis, *further.values()]
-    for name, point, expected in zip(("", *further), body.points, wanted, strict=True):
-        if np.linalg.norm(point - expected[:dimension]) > FILE_ROUNDING_SHARE * length:
-            if name:
-                where, told = f"node {name}", f"the arm's interface {name!r} is at {expected} m"
-            else:
-                where, told = "the outboard node", f"the arm's length is {length:.7g} m"
-                told += f"; it must be at (length{', 0' * (dimension - 1)})"
-            result = ", ".join(f"{x:.7g}" for x in point)
-            raise InputError(f"{path}: {where} is at ({result}) m, but {told}")
+    names = ["the outboard node", *(f"node {name}" for name in further)]
+    places = np.array([(length, 0.0, 0.0), *further.values()])[:, :dimension]
+    for where, point, expected in zip(names, body.points, places, strict=True):
+        if np.linalg.norm(point - expected) > FILE_ROUNDING_SHARE * length:
+            found, wanted = (", ".join(f"{x:.7g}" for x in at) for at in (point, expected))
+            raise InputError(
+                f"{path}: {where} is at ({found}) m, which the scene has at ({wanted}) m; correct "
+                "arms.length, arms.interfaces or the file"
+            )
     return body
 
 
@@ -431,7 +292,6 @@ def _plane_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.nda
 def _spatial_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return W (9, 1 + q, 1 + q), and K0_ab (9, q, q) or none; told apart as above."""
     q = data.num_modes
-    J = data.inertia(np.zeros(q))
     symmetric, turned = _from_rows(data.Oe.M1, _first_order(data.Cr))
     K0 = np.zeros_like(symmetric)
     if stiffened:
@@ -447,7 +307,7 @@ def _spatial_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.n
     skewed = np.einsum("abc,klc->abkl", -0.25 * PERMUTATION, coriolis)
     modes = symmetric + 0.5 * (skewed - skewed.swapaxes(2, 3))
     W = np.empty((3, 3, 1 + q, 1 + q))
-    W[:, :, 0, 0] = 0.5 * np.trace(J) * ONE - J
+    W[:, :, 0, 0] = about(data.inertia(np.zeros(q)), 0.5)
     W[:, :, 1:, 0], W[:, :, 0, 1:] = Y, Y.swapaxes(0, 1)
     # int Phi_a Phi_b with its coordinates exchanged is int Phi_b Phi_a.
     W[:, :, 1:, 1:] = 0.5 * (modes + modes.transpose(1, 0, 3, 2))
@@ -456,12 +316,10 @@ def _spatial_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.n
 
 def _from_rows(Oe: np.ndarray, Cr: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (Y_ab + Y_ba) / 2 and Y_ab - Y_ba, both (3, 3, ...), of Oe (..., 6), Cr (..., 3)."""
-    trace = -0.5 * Oe[..., :3].sum(axis=-1)
-    symmetric = np.empty((3, 3, *Oe.shape[:-1]))
-    for column, (a, b) in enumerate(PRODUCTS):
-        value = Oe[..., column] + trace if a == b else 0.5 * Oe[..., column]
-        symmetric[a, b] = symmetric[b, a] = value
-    return symmetric, np.einsum("abc,...c->ab...", -PERMUTATION, Cr)
+    turned = np.empty((3, 3, *Oe.shape[:-1]))
+    rows, columns = PRODUCTS
+    turned[rows, columns] = turned[columns, rows] = np.moveaxis(-Oe / TWICE, -1, 0)
+    return about(turned, 0.5), np.einsum("abc,...c->ab...", -PERMUTATION, Cr)
 
 
 def _centrifugal_excess(data: sid.StandardInputData, dimension: int) -> np.ndarray:
@@ -507,26 +365,24 @@ def _misplaced(first: sid.Node, tips: Sequence[sid.Node], dimension: int) -> Ite
     length = np.abs(last.origin.M0).max()
     if not length > 0.0:
         yield f"the outboard node {last.name} is at the origin"
-    push, turn = np.abs(last.phi.M0).max(), np.abs(last.psi.M0).max()
-    # Of the two scales the other follows over the arm's length.
-    push, turn = max(push, length * turn), max(turn, push / length)
-    checks = [
-        (first, "origin", first.origin.M0, length, "at the origin"),
-        (first, "phi", first.phi.M0, push, "held in the frame"),
-        (first, "psi", first.psi.M0, turn, "held in the frame"),
-    ]
+    # The largest displacement by a coordinate, of the interface or by its rotation over the length.
+    moved = max(np.abs(last.phi.M0).max(), length * np.abs(last.psi.M0).max())
+    scales = {"origin": length, "phi": moved, "psi": moved / length}
+    checks = [(first, name, getattr(first, name).M0, scale) for name, scale in scales.items()]
     if dimension == 2:
+        across = {"origin": [2], "phi": [2], "psi": [0, 1]}
         checks += [
-            (last, "origin", last.origin.M0[2], length, "in the plane z = 0"),
-            (last, "phi", last.phi.M0[2], push, "in the plane"),
-            (last, "psi", last.psi.M0[:2], turn, "in the plane"),
+            (last, name, getattr(last, name).M0[across[name]], scales[name]) for name in across
         ]
-    checks += [(node, "AP", node.AP.M0 - ONE, 1.0, "parallel") for node in (first, *tips)]
-    for node, name, values, scale, must in checks:
+    checks += [(node, "AP", node.AP.M0 - ONE, 1.0) for node in (first, *tips)]
+    for node, name, values, scale in checks:
+        which, must = "outboard", "in the plane z = 0"
+        if node is first:
+            which, must = "inboard", "at the origin and held in the frame"
         if (off := np.abs(values).max()) > FILE_ROUNDING_SHARE * scale:
             yield (
-                f"{name} of node {node.name} deviates by {off:.3g}; the "
-                f"{'inboard' if node is first else 'outboard'} node must be {must}"
+                f"{name} of node {node.name} deviates by {off:.3g}; the {which} node must be "
+                f"{'parallel to the frame' if name == 'AP' else must}"
             )
 
 

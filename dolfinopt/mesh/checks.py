@@ -149,12 +149,17 @@ def _refuse(bad: np.ndarray, corners: np.ndarray, what: str) -> None:
         raise InputError(f"{bad.sum()} cells {what}, the first at ({place}) m; repair the mesh")
 
 
-def _folded(corners: np.ndarray, tiny: np.ndarray) -> np.ndarray:
-    """Return (n,) True for cells that turn one way at a corner, the other way at another."""
+def corner_jacobians(corners: np.ndarray) -> np.ndarray:
+    """Return the Jacobians (n, 2^d) at the corners of cells (n, 2^d, d) in DOLFINx's order."""
     dim = corners.shape[2]
     grid = corners.reshape(-1, *dim * (2,), dim)  # z, y, x
     edges = [np.broadcast_to(np.diff(grid, axis=axis), grid.shape) for axis in range(dim, 0, -1)]
-    turn = np.linalg.det(np.stack(edges, axis=-1)).reshape(len(corners), -1)
+    return np.linalg.det(np.stack(edges, axis=-1)).reshape(len(corners), -1)
+
+
+def _folded(corners: np.ndarray, tiny: np.ndarray) -> np.ndarray:
+    """Return (n,) True for cells that turn one way at a corner, the other way at another."""
+    turn = corner_jacobians(corners)
     return np.asarray((turn.min(axis=1) < -tiny) & (turn.max(axis=1) > tiny))
 
 

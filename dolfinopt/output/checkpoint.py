@@ -20,7 +20,7 @@ from dolfinopt.dynamics.collocation import Strategy
 from dolfinopt.errors import InputError
 from dolfinopt.optimization.state import Memory
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
-from dolfinopt.parallel import Partition, gather_cells, on_root, together
+from dolfinopt.parallel import Partition, gather_tables, on_root, together
 from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import DIGEST, flattened, program, with_digests
@@ -84,10 +84,12 @@ def save(
     folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm], memory: Memory
 ) -> None:
     """Replace the checkpoint atomically (collective)."""
-    arrays = _of_arms(partition, arms, memory, len(scene.arms) + 1)
+    with together(partition.world):
+        own = {k: _of_arm(arm, k, memory) for k, arm in arms.items()}
+    tables = gather_tables(partition, own)
     with together(partition.world):
         if partition.world.rank == 0:
-            _sealed(folder, {**_stamp(scene), **arrays, **_of_run(memory)})
+            _sealed(folder, {**_stamp(scene), "memory": _packed(memory, tables)})
 
 
 def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
@@ -124,7 +126,7 @@ def load(
     if "memory" not in arrays:
         return None
     with together(partition.world):
-        return _memory(arrays, arms)
+        return _memory(arrays["memory"], arms)
 
 
 def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:
@@ -181,11 +183,15 @@ def _difference(theirs: Any, ours: Any) -> str:
 # -- the memory as arrays of whole arms, and back ------------------------------------------------
 
 
-def _of_run(memory: Memory) -> dict[str, np.ndarray]:
-    """Return what does not belong to single arms (root only)."""
+# By arm: its cells, nodes and modes, by their names.
+Tables = Mapping[int, Mapping[str, np.ndarray]]
+
+
+def _packed(memory: Memory, tables: Tables) -> np.ndarray:
+    """Return what does not belong to single arms, pickled with what does (root only)."""
     best = replace(memory.best, x=np.empty(0))
     memory = replace(memory, cells={LAW: memory.cells[LAW]}, modes={}, best=best)
-    return {"memory": np.frombuffer(pickle.dumps(memory), np.uint8)}
+    return np.frombuffer(pickle.dumps((memory, tables)), np.uint8)
 
 
 class _Unpickler(pickle.Unpickler):
@@ -207,60 +213,40 @@ def unpickled(data: np.ndarray, classes: Mapping[str, Sequence[str]]) -> Any:
     return reader.load()
 
 
-def _of_arms(
-    partition: Partition, arms: Mapping[int, Arm], memory: Memory, number: int
-) -> dict[str, np.ndarray]:
-    """Return cells, nodes and `number` sets of modes of whole arms, on the root (collective)."""
-    with together(partition.world):
-        own = {k: _of_arm(arm, k, memory, number) for k, arm in arms.items()}
-    names = ["centroid", "points", "cells"]
-    names += [f"{part}{j}" for j in range(number) for part in ("modes", "outboard")]
-    arrays: dict[str, np.ndarray] = {}
-    for name in names:
-        columns = gather_cells(partition, {k: x[name] for k, x in own.items() if name in x})
-        arrays |= {f"arm{k}/{name}": column for k, column in columns.items()}
-    return arrays
-
-
-def _of_arm(arm: Arm, index: int, memory: Memory, number: int) -> dict[str, np.ndarray]:
+def _of_arm(arm: Arm, index: int, memory: Memory) -> dict[str, np.ndarray]:
     """Return this rank's rows of one arm's arrays."""
     arrays = {"centroid": arm.mesh.centroid, "points": _interior_points(arm)}
     if index in memory.cells:  # an arm that repeats another's design has no variables
         arrays["cells"] = memory.cells[index]
-    for j in range(number):
-        arrays[f"modes{j}"], arrays[f"outboard{j}"] = _rows(arm, memory.modes[index], j)
+    inner = arm.substructure.T.num_interior
+    for j, modes in enumerate(memory.modes[index]):
+        arrays[f"modes{j}"], arrays[f"outboard{j}"] = modes[:inner], modes[inner:]
     return arrays
 
 
-def _memory(arrays: Mapping[str, np.ndarray], arms: Mapping[int, Arm]) -> Memory:
+def _memory(packed: np.ndarray, arms: Mapping[int, Arm]) -> Memory:
     """Return the checkpoint's memory, cells and modes of this rank's arms."""
-    memory: Memory = unpickled(arrays["memory"], CLASSES)
+    found: tuple[Memory, Tables] = unpickled(packed, CLASSES)
+    memory, tables = found
     cells = dict(memory.cells)
     for k, arm in arms.items():
-        if f"arm{k}/cells" in arrays:
-            rows = _match(arrays[f"arm{k}/centroid"], arm.mesh.centroid)
-            cells[k] = arrays[f"arm{k}/cells"][rows]
-    modes = {k: _modes(arrays, k, arm) for k, arm in arms.items()}
+        if "cells" in tables[k]:
+            rows = _match(tables[k]["centroid"], arm.mesh.centroid)
+            cells[k] = tables[k]["cells"][rows]
+    modes = {k: _modes(tables[k], arm) for k, arm in arms.items()}
     return replace(memory, cells=cells, modes=modes)
 
 
-def _modes(arrays: Mapping[str, np.ndarray], index: int, arm: Arm) -> list[np.ndarray]:
+def _modes(table: Mapping[str, np.ndarray], arm: Arm) -> list[np.ndarray]:
     """Return this rank's rows of an arm's sets of modes; its last rank has the interface's."""
-    nodes = _match(arrays[f"arm{index}/points"], _interior_points(arm))
+    nodes = _match(table["points"], _interior_points(arm))
     rows = (arm.mesh.dim * nodes[:, None] + np.arange(arm.mesh.dim)).ravel()
     is_last = arm.mesh.comm.rank == arm.mesh.comm.size - 1
     modes = []
     for j in range(len(arm.initial_vectors)):
-        interior, outboard = (arrays[f"arm{index}/{part}{j}"] for part in ("modes", "outboard"))
+        interior, outboard = table[f"modes{j}"], table[f"outboard{j}"]
         modes.append(np.vstack([interior[rows], outboard if is_last else outboard[:0]]))
     return modes
-
-
-def _rows(arm: Arm, modes: Sequence[np.ndarray], j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the interior rows of the j-th modes and those of the outboard interface, if any."""
-    inner = arm.substructure.T.num_interior
-    own = modes[j] if j < len(modes) else np.empty((inner, 0))
-    return own[:inner], own[inner:]
 
 
 def _interior_points(arm: Arm) -> np.ndarray:

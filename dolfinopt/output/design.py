@@ -21,7 +21,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.optimization.state import HistoryRow
-from dolfinopt.parallel import Partition, gather_cells, on_root, together
+from dolfinopt.parallel import Partition, gather_tables, on_root, together
 from dolfinopt.scene.law_variables import LAW, law_names, law_values, with_law
 from dolfinopt.scene.load import Arm as ArmKeys
 from dolfinopt.scene.load import Scene
@@ -105,8 +105,7 @@ def gather_views(
 
     with together(partition.world):
         mine = {index: of_arm(index, arm) for index, arm in arms.items()}
-    names = ["centroid", "density", "corners", "modes", *["filtered"] * (x_filtered is not None)]
-    cells = {name: gather_cells(partition, {k: x[name] for k, x in mine.items()}) for name in names}
+    cells = gather_tables(partition, mine)
     with together(partition.world):
         if partition.world.rank == 0:
             return _views(scene, cells, stress or {})
@@ -114,7 +113,7 @@ def gather_views(
 
 
 def _views(
-    scene: Scene, cells: Mapping[str, Mapping[int, np.ndarray]], stress: Mapping[int, ArmStress]
+    scene: Scene, cells: Mapping[int, Mapping[str, np.ndarray]], stress: Mapping[int, ArmStress]
 ) -> list[ArmView]:
     """Return the views of all arms in the chain, given cells of those with a design (root only)."""
     views = []
@@ -123,8 +122,8 @@ def _views(
         if owner is None:
             views.append(_undesigned_view(keys, scene.dimension))
             continue
-        order = canonical_order(cells["centroid"][owner])
-        own = {name: by_arm[owner][order] for name, by_arm in cells.items()}
+        order = canonical_order(cells[owner]["centroid"])
+        own = {name: values[order] for name, values in cells[owner].items()}
         around, known = TENSOR[own["corners"].shape[1:]], stress.get(index)
         own |= {name: own[name][:, around] for name in ("corners", "modes")}
         views.append(
@@ -162,12 +161,9 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
 
 def _undesigned_view(arm: ArmKeys, dimension: int) -> ArmView:
     """Return an arm without a design as one box from joint to joint, undeformed."""
-    ring = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
-    corners = (ring + np.array([0.5, 0.0])) * [arm.length, arm.height]
-    if dimension == 3:
-        section = ring * [arm.height, arm.thickness]
-        ends = [np.column_stack([np.full(4, x), section]) for x in (0.0, arm.length)]
-        corners = np.concatenate(ends)
+    unit = np.indices((2,) * dimension).reshape(dimension, -1)[::-1].T
+    unit = unit[TENSOR[2**dimension, dimension]] - [0.0, 0.5, 0.5][:dimension]
+    corners = unit * [arm.length, arm.height, arm.thickness][:dimension]
     modes, centroid = np.zeros((1, *corners.shape, 0)), corners.mean(axis=0)
     return ArmView(arm.name, corners[None], centroid[None], np.ones(1), modes, False, arm.length)
 
@@ -220,17 +216,22 @@ def write_gradient(
     Of a shared design once, under the name of the arm it belongs to; of arms that repeat another's
     design each arm's own, which add up cell by cell.
     """
-    centroids = gather_cells(partition, {k: arm.mesh.centroid for k, arm in arms.items()})
+    mine = {
+        k: {
+            "centroid": arm.mesh.centroid,
+            "gradient": by_cell.get(k, np.zeros(arm.mesh.num_cells)),
+        }
+        for k, arm in arms.items()
+    }
+    tables = gather_tables(partition, mine)
     by_law = by_law_name(scene, by_cell.get(LAW, np.zeros(0)))
-    gathered = gather_cells(partition, {k: x for k, x in by_cell.items() if k != LAW})
     with together(partition.world):
         if partition.world.rank != 0:
             return
         arrays: dict[str, Any] = {"objective": objective, **by_law}
-        for index, centroid in centroids.items():
-            order, name = canonical_order(centroid), scene.arms[index].name
-            arrays[f"{name}/centroid"] = centroid[order]
-            arrays[f"{name}/gradient"] = gathered.get(index, np.zeros(len(order)))[order]
+        for index, table in tables.items():
+            order, name = canonical_order(table["centroid"]), scene.arms[index].name
+            arrays |= {f"{name}/{key}": values[order] for key, values in table.items()}
         unit = scene.objective.response.unit  # per physical density, which has none
         arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
         write_arrays(path, arrays)

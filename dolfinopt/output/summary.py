@@ -28,7 +28,7 @@ from dolfinopt.output.feed_forward import comparison_of, lead_warnings, summary_
 from dolfinopt.output.joint_limits import joint_limits
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import UNITS, drive_units, free_drives, trajectory_units
-from dolfinopt.parallel import Partition, gather_arms, gather_cells, together
+from dolfinopt.parallel import Partition, gather_arms, gather_tables, together
 from dolfinopt.profiling import Counts
 from dolfinopt.responses.constraints import limits_of, summary_of
 from dolfinopt.responses.evaluation import Evaluation, Motion
@@ -420,29 +420,30 @@ def _widths(
 ) -> dict[int, Widths]:
     """Return the widths of member and gap of the designs cut at one half; on the root."""
     # Of solid arms where the scene asks for a width: voxels take seconds.
-    corners, solid, fixed, asked = {}, {}, {}, {}
+    mine: dict[int, dict[str, np.ndarray]] = {}
+    asked = {}
     with together(partition.world):
         for k, arm in arms.items():
             mesh, design = arm.mesh, arm.scene.design
             if mesh.dim == 3 and not design.controls_widths:
                 continue
             points = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
+            table = {"corners": points, "solid": x_phys[k] > SOLID, "fixed": mesh.fixed}
             if arm.scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
-                points = _lowest(mesh.comm, points)
-            corners[k], solid[k], fixed[k] = points, x_phys[k] > SOLID, mesh.fixed
+                table["corners"] = points[:, :4, :2]
+                lowest = _lowest(mesh.comm, points[:, :4, 2], arm.scene.arms[k].thickness)
+                table = {name: values[lowest] for name, values in table.items()}
+            mine[k] = table
             asked[k] = max(design.least_widths)
-    cells, cut, stays = (gather_cells(partition, item) for item in (corners, solid, fixed))
-    asked = gather_arms(partition, asked)
+    tables, asked = gather_tables(partition, mine), gather_arms(partition, asked)
     with together(partition.world):
-        return {k: widths_of(cells[k], cut[k], stays[k], asked[k]) for k in cells}
+        return {k: widths_of(**table, asked=asked[k]) for k, table in tables.items()}
 
 
-def _lowest(comm: MPI.Comm, points: np.ndarray) -> np.ndarray:
-    """Return a box's cells' lower faces (n, 4, 2), m; nan above the lowest layer (collective)."""
-    low = comm.allreduce(points[:, :, 2].min(initial=np.inf), op=MPI.MIN)
-    high = comm.allreduce(points[:, :, 2].max(initial=-np.inf), op=MPI.MAX)
-    at = points[:, :4, 2].max(axis=1, initial=-np.inf) <= low + 1e-9 * (high - low)
-    return np.where(at[:, None, None], points[:, :4, :2], np.nan)
+def _lowest(comm: MPI.Comm, z: np.ndarray, thickness: float) -> np.ndarray:
+    """Return which cells' lower faces (n, 4), m, bound a box from below (collective)."""
+    low = comm.allreduce(z.min(initial=np.inf), op=MPI.MIN)
+    return z.max(axis=1, initial=-np.inf) <= low + 1e-9 * thickness
 
 
 def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
@@ -476,14 +477,11 @@ def _contact_warnings(run: RankResult, traits: Mapping[int, _Traits]) -> Iterato
         contacts, arm = trait.contacts, scene.arms[k]
         if not contacts.count:
             continue
-        kinds = {"corner": contacts.corners, "edge": contacts.edges}
-        counts = [f"{n} {kind}{'s' if n > 1 else ''}" for kind, n in kinds.items() if n]
-        pieces = "1 piece" if contacts.pieces == 1 else f"{contacts.pieces} pieces"
         place = ", ".join(f"{x:.4g}" for x in contacts.places[0])
         text = (
-            f"cut at a density of 0.5, arm {arm.name!r} is {pieces} that touch in "
-            f"{' and '.join(counts)} of cells alone, the worst at ({place}) m: such contacts are "
-            "stiff in the model, and no joints in a workshop"
+            f"cut at a density of 0.5, cells of arm {arm.name!r} meet in {contacts.corners} "
+            f"corners and {contacts.edges} edges alone (pieces: {contacts.pieces}), the worst at "
+            f"({place}) m: such contacts are stiff in the model, and no joints in a workshop"
         )
         if rated and run.crisp is not None:
             text += f"; crisp leaves them out, and {100.0 * contacts.left_out:.2g} % of the solid"
@@ -508,8 +506,7 @@ def _against_contacts(scene: Scene, index: int, size: float) -> str:
         wider = max(least, radius + 0.5 * size)
         key = "a larger design.minimum_member"
         result.append(key if design.controls_widths else f"design.filter_radius = {wider:.4g}")
-    *rest, last = result
-    return f"set {', '.join(rest)}{' and ' if rest else ''}{last}, or use finer cells"
+    return f"set {', '.join(result)}, or use finer cells"
 
 
 def _large_deflections(scene: Scene, evaluation: Evaluation) -> Iterator[str]:

@@ -92,10 +92,8 @@ def draw_panel(axes: Axes, panel: Panel, styles: Looks | None = None) -> None:
         log2_scale(axes)
     elif len(x) and (x % 1 == 0).all() and not panel.log:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, steps=[1, 2, 5, 10]))
-    axes.set_title(panel.title)
+    axes.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
     axes.set_title(panel.note, loc="right")
-    axes.set_xlabel(panel.x_label)
-    axes.set_ylabel(panel.y_label)
     axes.grid(True, alpha=0.3)
 
 

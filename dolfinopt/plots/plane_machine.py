@@ -19,18 +19,18 @@ from dolfinopt.plots.poses import Poses
 from dolfinopt.plots.style import (
     COLOURS,
     DENSITY,
+    FRAME,
     GREY,
     ORANGE,
     SOLID_FROM,
-    framed_axes,
     mixed,
+    stacked_axes,
 )
 
 BASE = "#c9c9c9"  # carts, pedestals and sliders
 UNDESIGNED = "#8a8a8a"  # arms without a design
 SIDES = (0.75, 0.95)  # inches left and right of the axes, for y and for the scale of colours
 ROOM = 0.13  # around what is seen, of the arms' reach: for the instants
-GUIDE = 0.09  # over the arms' reach: by which guides are longer than the way of a slider
 THIN, BAR, DOT, MARK = 1.0, 5.0, 5.0, 18.0  # points: lines, rigid arms, joints, supports
 CART = "s"
 
@@ -54,13 +54,13 @@ class PlaneStage:
         self.stands = np.ptp(poses.held[:, 0], axis=0).max() == 0.0
         points = np.concatenate([poses.reached(views), *paths])
         low, high = points.min(axis=0) - ROOM * size, points.max(axis=0) + ROOM * size
-        self.figure, self.axes, _ = framed_axes(low, high, title, SIDES)
+        self.figure, (self.axes,) = stacked_axes([(low, high)], title, sides=SIDES, **FRAME)
         self.axes.set(xlabel="x [m]", ylabel="y [m]")
         self.axes.grid(True, alpha=0.3)
         bar = self.axes.inset_axes((1.02, 0.0, 0.025, 1.0))
         self.figure.colorbar(ScalarMappable(cmap=COLOURS), cax=bar, label=DENSITY)
-        for tie, ends in zip(poses.loops.ties, poses.tied.swapaxes(0, 1), strict=True):
-            self._draw_closure(tie, ends)
+        for tie, (_, point) in zip(poses.loops.ties, poses.tied[0], strict=True):
+            self._draw_closure(tie, point)
         if not self.stands:
             self.axes.axhline(poses.held[0, 0, 1], color=GREY, lw=THIN)
         self.keep()
@@ -123,23 +123,16 @@ class PlaneStage:
         colour = mixed(BASE, strength)
         self.axes.plot(*place, marker=marker, ms=MARK, mfc=colour, mec="black", zorder=1.5)
 
-    def _draw_closure(self, tie: Tie, ends: np.ndarray) -> None:
-        """Draw what stands of a closure with the ground: guide or support.
-
-        Args:
-            tie: the closure.
-            ends: (2, n, 2) places of both its frames at n instants, m.
-        """
-        across, point = _across(tie), ends[1][0]
+    def _draw_closure(self, tie: Tie, point: np.ndarray) -> None:
+        """Draw what stands of a closure with the ground at a place (2,), m: guide or support."""
+        across = _across(tie)
         if tie.b is not None:
             return
         if across is None:
             self._mark(point, CARETUP)
             return
-        along = np.array([across[1], -across[0]])
-        s, more = (ends[0] - point) @ along, GUIDE * self.poses.size
-        guide = point + np.outer([s.min() - more, s.max() + more], along)
-        self.axes.plot(*guide.T, color=GREY, lw=THIN)
+        further = np.add(point, [across[1], -across[0]])
+        self.axes.axline(tuple(point), tuple(further), color=GREY, lw=THIN)
 
     def keep(self) -> None:
         """Keep what has been drawn so far in all frames."""

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
 Colour = str | tuple[float, float, float]
-# Where lights are, from the camera's point of view, and how strong.
-LIGHTS = (((0.35, 0.75, 1.0), 0.75), ((-0.6, 0.1, 0.8), 0.3))
+SIDES = 60  # of a round bar
 EDGE = 35.0  # degrees between faces from which an edge stays sharp
 SHADED = {"smooth_shading": True, "split_sharp_edges": True, "feature_angle": EDGE, "ambient": 0.3,
           "diffuse": 0.85, "specular": 0.1}  # fmt: skip
@@ -75,22 +74,19 @@ class Studio:
     """Solids in front of a camera, rendered off-screen, with no word in the picture.
 
     Attributes:
-        low, high: (2,) what of the camera's plane is seen, m.
+        axes: that show the camera's plane, m, to one scale.
         back: (3,) unit vector towards the viewer.
         plotter: PyVista's; holds the solids.
     """
 
-    def __init__(self, camera: Camera, low: np.ndarray, high: np.ndarray, px_per_m: float) -> None:
-        self.low, self.high, self.back = low, high, camera.back
+    def __init__(self, camera: Camera, axes: Axes) -> None:
+        self.axes, self.back = axes, camera.back
+        low, high = np.transpose([axes.get_xlim(), axes.get_ylim()])
+        px_per_m = axes.bbox.width / (high - low)[0]
         size = [int(np.ceil(n)) for n in (high - low) * px_per_m]
         theme = pyvista.themes.DocumentTheme()
         theme.multi_samples = 4  # eight double the time of the software renderer
-        self.plotter: Any = pyvista.Plotter(
-            off_screen=True, window_size=size, theme=theme, lighting="none"
-        )
-        for place, strength in LIGHTS:
-            light = pyvista.Light(position=place, light_type="camera light", intensity=strength)
-            self.plotter.add_light(light)
+        self.plotter: Any = pyvista.Plotter(off_screen=True, window_size=size, theme=theme)
         focus = 0.5 * (low + high) @ np.stack([camera.right, camera.up])
         seen = self.plotter.camera
         seen.focal_point, seen.position, seen.up = focus, focus + camera.back, camera.up
@@ -106,8 +102,7 @@ class Studio:
         if len(surface.triangles):
             mesh = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
             if "scalars" in look:
-                mesh.cell_data["values"] = look.pop("scalars")
-                look |= {"scalars": "values", "ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
+                look |= {"ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
             self.add(mesh, **look)
 
     def line(self, points: np.ndarray, colour: Colour, width: float = 1.0) -> None:
@@ -118,12 +113,8 @@ class Studio:
 
     def bar(self, ends: np.ndarray, radius: float, colour: Colour = BAR) -> None:
         """Draw a round bar between two points (2, 3), m; nothing where they coincide."""
-        along = ends[1] - ends[0]
-        if (length := float(np.linalg.norm(along))) > 1e-9:
-            mesh: Any = pyvista.Cylinder(
-                center=ends.mean(axis=0), direction=along / length, radius=radius, height=length
-            )
-            self.add(mesh.triangulate(), color=colour)
+        if not np.allclose(*ends):
+            self.add(pyvista.Line(*ends).tube(radius=radius, n_sides=SIDES), color=colour)
 
     def ball(self, centre: np.ndarray, radius: float, colour: Colour) -> None:
         """Draw a sphere."""
@@ -142,10 +133,10 @@ class Studio:
         finally:
             self.plotter.close()
 
-    def show(self, axes: Axes, image: np.ndarray) -> Any:
-        """Put a picture into axes; return Matplotlib's image."""
-        extent = (self.low[0], self.high[0], self.low[1], self.high[1])
-        return axes.imshow(image, extent=extent, interpolation="antialiased", aspect="auto")
+    def show(self, image: np.ndarray) -> Any:
+        """Put a picture into the axes; return Matplotlib's image."""
+        extent = (*self.axes.get_xlim(), *self.axes.get_ylim())
+        return self.axes.imshow(image, extent=extent, interpolation="antialiased", aspect="auto")
 
 
 def material(view: ArmView, *, modes: bool = False) -> Surface:
@@ -245,17 +236,14 @@ def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: 
         edges: whether the box is drawn.
         look: colours, see `Studio.solid`.
     """
-    limits = (*axes.get_xlim(), *axes.get_ylim())
-    scale = axes.bbox.width / (limits[1] - limits[0])  # px per m
-    studio = Studio(LINKS, *_seen(box), scale)
+    studio = Studio(LINKS, axes)
     studio.solid(surface, **look)
     if edges:
-        lines = pyvista.Box([value for pair in zip(*box) for value in pair])
+        lines = pyvista.Box(np.transpose(box).ravel())
         studio.plotter.add_mesh(lines, style="wireframe", color=GREY, lighting=False, **PLAIN)
-    studio.show(axes, studio.close())
-    axes.axis(limits)
+    studio.show(studio.close())
     axes.set_axis_off()
-    (low, high), px = box, 1.0 / scale
+    (low, high), px = box, float(np.ptp(axes.get_xlim())) / axes.bbox.width  # m
     corner = LINKS.plane(np.array([low[0], low[1], high[2]]))  # at the front, below
     draw_length(axes, corner - [0.0, 30.0 * px], round_number(0.2 * (high - low)[0]), 8.0 * px)
     draw_triad(axes, LINKS, corner + np.array([-42.0, 24.0]) * px, 26.0 * px)

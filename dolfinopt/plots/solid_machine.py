@@ -21,7 +21,7 @@ from dolfinopt.plots.solid import (
     draw_triad,
     material,
 )
-from dolfinopt.plots.style import DPI, ORANGE, framed_axes, mixed, round_number
+from dolfinopt.plots.style import FRAME, ORANGE, mixed, round_number, stacked_axes
 
 ELEVATION = np.radians(25.0)  # of the viewer
 AZIMUTHS = np.radians(np.arange(-75.0, 270.0, 30.0))
@@ -56,15 +56,15 @@ class SolidStage:
         ends += [self.flat(foot) + PLATE * self.size * np.array([[-1.0, -1.0], [1.0, 1.0]])]
         flat = np.concatenate(ends)
         low, high = flat.min(axis=0) - ROOM * self.size, flat.max(axis=0) + ROOM * self.size
-        self.figure, self.axes, scale = framed_axes(low, high, title, SIDES)
+        self.figure, (self.axes,) = stacked_axes([(low, high)], title, sides=SIDES, **FRAME)
         self.axes.set_axis_off()
         self._draw_ruler(low, high - low)
-        self.studio = Studio(self.camera, low, high, scale * DPI)
+        self.studio = Studio(self.camera, self.axes)
         plate = np.stack([foot - ROD * self.size * self.up, foot])
         self.studio.bar(plate, PLATE * self.size, "#e4e4e4")
         for place in poses.origin[0, [parent == GROUND for parent in poses.parents]]:
             self.studio.bar(np.stack([foot, place]), 2.0 * ROD * self.size)
-        self.image = self.studio.show(self.axes, self.studio.render())
+        self.image = self.studio.show(self.studio.render())
         self.keep()
 
     def _foot(self) -> np.ndarray:
@@ -167,10 +167,9 @@ def camera_of(poses: Poses, up: np.ndarray) -> Camera:
     """Return the view in which the machine's places spread most."""
     east, north = np.roll(np.eye(3), -1 - int(np.argmax(np.abs(up))), axis=0)[:2]
     points = np.concatenate([poses.origin, poses.outboard], axis=1).reshape(-1, 3)
-    cameras, spreads = [], []
-    for azimuth in AZIMUTHS:
-        level = np.cos(azimuth) * east + np.sin(azimuth) * north
-        cameras.append(camera_from(np.cos(ELEVATION) * level + np.sin(ELEVATION) * up, up))
-        spreads.append(float(np.linalg.det(np.cov(cameras[-1].plane(points).T))))
+    levels = np.outer(np.cos(AZIMUTHS), east) + np.outer(np.sin(AZIMUTHS), north)
+    backs = np.cos(ELEVATION) * levels + np.sin(ELEVATION) * up
+    cameras = [camera_from(back, up) for back in backs]
+    spreads = np.linalg.det([np.cov(camera.plane(points).T) for camera in cameras])
     # Of views that spread alike the first.
-    return cameras[int(np.argmax(np.array(spreads) > (1.0 - 1e-9) * max(spreads)))]
+    return cameras[int(np.argmax(spreads > (1.0 - 1e-9) * spreads.max()))]

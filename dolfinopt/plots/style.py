@@ -147,9 +147,10 @@ STYLE: Any = {
     "text.parse_math": False,
 }
 TITLE = 12  # points, of what stands above a whole figure
-WIDTH, HEIGHT, NARROW = 13.0, 16.0, 8.0  # inches: the most that stacked axes take, the least width
+WIDTH, HEIGHT, NARROW = 13.0, 16.0, 8.0  # inches: most of stacked axes, least of a figure
 LEFT, RIGHT, HEAD = 0.85, 0.5, 0.5  # inches beside and above axes, for labels and the title
-FRAME, FOOT = np.array([7.5, 7.0]), 0.85  # inches, of axes alone, and below them
+# Of a machine: most inches of its axes, and inches above and below them.
+FRAME: Any = {"most": (7.5, 7.0), "above": 0.25, "below": 0.0, "foot": 0.85}
 
 Drawing = TypeVar("Drawing", bound=Callable[..., Any])
 
@@ -184,34 +185,12 @@ def new_figure(width: float, height: float, *, laid_out: bool = False) -> Figure
     return figure
 
 
-def headline(figure: Figure, title: str, left: float = LEFT) -> None:
+def headline(figure: Figure, title: str, left: float) -> None:
     """Write as much of a title above a figure as fits; `left` of it, inches."""
     width, height = figure.get_size_inches()
     most = int(8.0 * (width - left))  # letters
     words = title if len(title) <= most else title[: max(0, most - 3)] + "..."
     figure.text(left / width, 1.0 - 0.12 / height, words, va="top", fontsize=TITLE, weight="bold")
-
-
-def framed_axes(
-    low: np.ndarray, high: np.ndarray, title: str, sides: tuple[float, float]
-) -> tuple[Figure, Axes, float]:
-    """Return a figure, its axes for a part of the plane, of equal scales, and inches per metre.
-
-    Args:
-        low, high: corners (2,) of the part, m.
-        title: above it.
-        sides: least room left and right, inches.
-    """
-    span = high - low
-    scale = float(np.min(FRAME / span))
-    wide, tall = scale * span
-    width, height = max(NARROW - 1.0, wide + sum(sides)), tall + 1.5 * HEAD + FOOT
-    figure = new_figure(width, height)
-    headline(figure, title, sides[0])
-    left = sides[0] + 0.5 * (width - wide - sum(sides))
-    axes = figure.add_axes((left / width, FOOT / height, wide / width, tall / height))
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), autoscale_on=False)
-    return figure, axes, scale
 
 
 def stacked_axes(
@@ -222,6 +201,8 @@ def stacked_axes(
     below: float = 0.3,
     foot: float = 0.0,
     least: float = 0.0,
+    sides: tuple[float, float] = (LEFT, RIGHT),
+    most: tuple[float, float] = (WIDTH - LEFT - RIGHT, HEIGHT),
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure with axes below each other, to one scale and with one range of x.
 
@@ -231,20 +212,23 @@ def stacked_axes(
         above, below: room for words at each, inches.
         foot: room below all of them, inches.
         least: height of axes, inches.
+        sides: room left and right of them, inches; more where the title needs it.
+        most: width and height that all of them take, inches.
     """
     lows, highs = (np.array(ends, dtype=float) for ends in zip(*boxes, strict=True))
     left, right = lows[:, 0].min(), highs[:, 0].max()
     tall = (highs - lows)[:, 1]
-    scale = min((WIDTH - LEFT - RIGHT) / (right - left), HEIGHT / tall.sum())
+    scale = min(most[0] / (right - left), most[1] / tall.sum())
     heights, wide = np.maximum(scale * tall, least), scale * (right - left)
-    width, head = max(NARROW, wide + LEFT + RIGHT), HEAD if title else 0.0
+    width, head = max(NARROW, wide + sum(sides)), HEAD if title else 0.0
     height = head + foot + float((heights + above + below).sum())
     figure = new_figure(width, height)
-    headline(figure, title)
+    headline(figure, title, sides[0])
+    beside = sides[0] + 0.5 * (width - wide - sum(sides))
     rows, top = [], height - head
     for middle, inches in zip(0.5 * (lows + highs)[:, 1], heights, strict=True):
         top -= above + inches
-        axes = figure.add_axes((LEFT / width, top / height, wide / width, inches / height))
+        axes = figure.add_axes((beside / width, top / height, wide / width, inches / height))
         half = 0.5 * inches / scale
         axes.set(xlim=(left, right), ylim=(middle - half, middle + half))
         rows.append(axes)

@@ -177,7 +177,7 @@ def test_contacts_are_told_and_robust_designs_have_none(projection, radius, tmp_
     (text,) = told
     x, y = own["places"][0]
     assert f"the worst at ({x:.4g}, {y:.4g}) m" in text and f"{own['corners']} corners" in text
-    cure = f'"robust", design.erosion = 0.25 and design.filter_radius = {2.0 * CELL:.4g}'
+    cure = f'"robust", design.erosion = 0.25, design.filter_radius = {2.0 * CELL:.4g}'
     assert cure in text and text in printed.err
     counted = f"arm1 falls into {own['pieces']} pieces, {own['corners']} of whose contacts"
     assert counted in printed.out

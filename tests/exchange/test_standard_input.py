@@ -266,12 +266,12 @@ def test_what_is_no_body_is_refused(name, dimension):
 
 @pytest.mark.parametrize(
     ("dimension", "place", "wanted"),
-    [(2, "(1, 0.2) m", "(length, 0)"), (3, "(1, 0.2, -0.1) m", "(length, 0, 0)")],
+    [(2, "(1, 0.2) m", "(1, 0) m"), (3, "(1, 0.2, -0.1) m", "(1, 0, 0) m")],
 )
 def test_length_must_agree(tmp_path, dimension, place, wanted):
     body = body_of(dimension, 1, 4)
     write_sid(tmp_path / "a.sid", sid_of(body))
-    with refused("a.sid: ", place, "1 m", wanted):
+    with refused("a.sid: ", place, wanted, "arms.length"):
         load_body(tmp_path / "a.sid", dimension, length=1.0)
     point = np.zeros(dimension)
     point[0] = 0.5

@@ -172,7 +172,7 @@ def test_the_start_weighs_what_the_file_says(tmp_path):
     start = uniform_design(scene, partition, arms, scene.design.initial)
     found = sum(scene.material_of(k).density * arm.mesh.area @ start[k] for k, arm in arms.items())
     robot = read_robot(DEMO)
-    expected = sum(robot.links[name].own.mass for name in ("upper_arm", "forearm"))
+    expected = sum(robot.links[name].inertia.mass for name in ("upper_arm", "forearm"))
     assert found == pytest.approx(expected, rel=0.01)  # of the filter's ends
     fractions = [arm.volume_fraction(start[k]) for k, arm in arms.items()]
     assert np.mean(fractions) == pytest.approx(scene.design.volume_fraction, rel=0.01)
@@ -241,7 +241,7 @@ def test_geometry_is_mended(shapes, volume, done):
     check_cells(found.points, found.cells[:, TENSOR[8, 3]])
     assert 1500 < len(found.cells) < 20000
     if volume is not None:  # but for corners, and voxels of open surfaces
-        assert found.volume == pytest.approx(volume, rel=0.06 if "fill" in str(done) else 0.01)
+        assert found.volume == pytest.approx(volume, rel=0.03 if "fill" in str(done) else 0.01)
         for facets in (found.inboard, found.outboard):
             assert np.ptp(found.points[facets][..., 0]) < 1e-12
     else:

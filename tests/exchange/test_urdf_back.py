@@ -44,10 +44,10 @@ def test_there_and_back(imported, tmp_path):
     again = read_robot(back)
     assert list(again.links) == list(robot.links) and same_kinematics(robot, again)
     for name, link in robot.links.items():
-        own = again.links[name].own
-        assert own.mass == pytest.approx(link.own.mass, rel=1e-15)
-        assert np.abs(own.centre - link.own.centre).max() < 1e-15
-        assert np.abs(own.tensor - link.own.tensor).max() < 1e-14
+        own = again.links[name].inertia
+        assert own.mass == pytest.approx(link.inertia.mass, rel=1e-15)
+        assert np.abs(own.centre - link.inertia.centre).max() < 1e-15
+        assert np.abs(own.tensor - link.inertia.tensor).max() < 1e-14
     text = back.read_text()
     if file == DEMO:
         assert "Denavit-Hartenberg" in text and "the rod between shoulder and elbow" in text
@@ -74,8 +74,8 @@ def test_new_meshes_take_the_place_of_all_shapes(tmp_path):
     robot = read_robot(back)
     upper, hand_link = robot.links["upper"], robot.links["hand"]
     assert not upper.missing and not hand_link.missing
-    assert (upper.own.mass, *upper.own.centre) == (2.5, 0.1, 0.2, 0.3)
-    assert np.array_equal(upper.own.tensor, body.tensor)
+    assert (upper.inertia.mass, *upper.inertia.centre) == (2.5, 0.1, 0.2, 0.3)
+    assert np.array_equal(upper.inertia.tensor, body.tensor)
     assert len(upper.shapes) == 1 and upper.volume == pytest.approx(4 / 3 * np.pi * 1e-3, rel=0.02)
     assert hand_link.volume == pytest.approx(2 * 0.1 * 0.2 * 0.3)
     inside = back.read_text().split('<link name="upper">')[1].split("</link>")[0]
@@ -158,19 +158,19 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys):
     before, after = read_robot(DEMO), read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
     assert same_kinematics(before, after)
     fore = after.links["forearm"]
-    assert fore.own.mass == pytest.approx(summary["mass"]["forearm"], rel=1e-12)
+    assert fore.inertia.mass == pytest.approx(summary["mass"]["forearm"], rel=1e-12)
     assert all(one.is_watertight for one in fore.shapes)
-    assert fore.volume == pytest.approx(fore.own.mass / 2700.0, rel=0.01)
+    assert fore.volume == pytest.approx(fore.inertia.mass / 2700.0, rel=0.01)
     # Its frame is the link's: the rod's middle beside the elbow, from it to the wrist.
-    assert fore.own.centre == pytest.approx([-0.36435, 0.0, 0.06], abs=1e-9)
+    assert fore.inertia.centre == pytest.approx([-0.36435, 0.0, 0.06], abs=1e-9)
     assert fore.points.min(axis=0) == pytest.approx([-0.7287, -0.055, 0.005], abs=1e-3)
     assert implausible_inertias(after) == []
     run_import(tmp_path / "run" / "urdf" / "robot.urdf", "forearm", DEMO_MOTION, tmp_path / "b")
     trees = [tree_of(tmp_path / name / "robot.toml")["arms"] for name in "ab"]
     masses = [[(arm["name"], arm.get("mass")) for arm in tree] for tree in trees]
     assert masses[0] == masses[1]
-    total = sum(link.own.mass for link in after.links.values())
-    rest = sum(link.own.mass for name, link in before.links.items() if name != "forearm")
+    total = sum(link.inertia.mass for link in after.links.values())
+    rest = sum(link.inertia.mass for name, link in before.links.items() if name != "forearm")
     assert total == pytest.approx(rest + summary["mass"]["forearm"], rel=1e-9)
     # Parts that were made are the links, whatever has become of their shape.
     run("part", tmp_path / "run", "--no-check", "--no-plots")

@@ -14,6 +14,7 @@ from dolfinopt.output.design import ArmView, designed
 from dolfinopt.plots import machine, solid
 from dolfinopt.plots.design import design_figure
 from dolfinopt.plots.poses import body_poses
+from dolfinopt.plots.style import DPI, new_figure
 
 pytestmark = pytest.mark.serial
 CELLS, SIZE = (20, 4, 2), np.array([0.5, 0.1, 0.05])
@@ -35,10 +36,11 @@ def test_projected_area_of_a_link():
     """A full box covers the sum of its faces' projections, half of it half as much."""
 
     def drawn(view):
-        low, high = np.array([-0.1, -0.3]), np.array([0.6, 0.3])
-        studio = solid.Studio(solid.LINKS, low, high, 1000.0)
+        axes = new_figure(7.0, 6.0).add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set(xlim=(-0.1, 0.6), ylim=(-0.3, 0.3))
+        studio, px_per_m = solid.Studio(solid.LINKS, axes), 10.0 * DPI
         studio.solid(solid.material(view), color=solid.STEEL)
-        return float((studio.close() < 250).any(axis=-1).sum()) / 1000.0**2
+        return float((studio.close() < 250).any(axis=-1).sum()) / px_per_m**2
 
     def expected(x, y, z):
         return float(np.abs(solid.LINKS.back) @ [y * z, x * z, x * y])

@@ -268,7 +268,7 @@ def test_interrupted_optimisation_goes_on(plan, done, tmp_path, monkeypatch, whe
             run_cases([made], tmp_path, SELF, shown=False)
     left = tmp_path / "cases" / made.key
     assert not (left / "summary.json").exists()
-    assert pickle.loads(np.load(left / "checkpoint.npz")["memory"]).iteration == reached
+    assert pickle.loads(np.load(left / "checkpoint.npz")["memory"])[0].iteration == reached
     iterations = []
     step = iterate.Iterate.step
     monkeypatch.setattr(

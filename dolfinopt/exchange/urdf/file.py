@@ -8,7 +8,6 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +16,7 @@ import numpy as np
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.robot import (
+    MASSLESS,
     MOVABLE,
     Inertia,
     Mimic,
@@ -30,6 +30,8 @@ from dolfinopt.scene.tables.arms import tensor_problem
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
+# What trimesh logs is not printed: errors are told in one line.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
 SECTIONS = 64  # flat sides of a cylinder
 # Of shapes: attributes, with as many numbers as each has.
 SIZES = {
@@ -64,22 +66,9 @@ def read_robot(file: Path) -> Robot:
         _check_names(file, kind, [item.get("name", "") for item in items])
     joints = [_joint(file, item) for item in elements["joint"]]
     _check_mimics(file, joints)
-    with _quiet():
-        links = {item.get("name"): _link(file, item) for item in elements["link"]}
+    links = {item.get("name"): _link(file, item) for item in elements["link"]}
     first, ordered = _ordered(file, list(links), joints)
     return Robot(root.get("name") or file.stem, file, links, ordered, first)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what trimesh logs to itself: errors are told in one line."""
-    logger = logging.getLogger("trimesh")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
 
 
 def safe_xml(file: Path) -> Any:
@@ -261,7 +250,7 @@ def _ordered(
 
 def _link(file: Path, xml: Any) -> RobotLink:
     name = xml.get("name")
-    where, inertia = f"{file}: link {name!r}", None
+    where, inertia = f"{file}: link {name!r}", MASSLESS
     if (inertial := xml.find("inertial")) is not None:
         own = _Element(f"{where}: inertial", inertial)
         tensor = np.empty((3, 3))
@@ -276,8 +265,7 @@ def _link(file: Path, xml: Any) -> RobotLink:
     shapes, missing = _shapes(file, collisions or visuals)
 
     def visual() -> tuple[Trimesh, ...]:
-        with _quiet():
-            return _shapes(file, visuals)[0]
+        return _shapes(file, visuals)[0]
 
     return RobotLink(name, inertia, shapes, missing, visual if collisions and visuals else None)
 
@@ -427,7 +415,7 @@ def implausible_inertias(robot: Robot) -> list[str]:
 
 
 def _of_link(robot: Robot, link: RobotLink) -> Iterator[str]:
-    mass, tensor = link.own.mass, link.own.tensor
+    mass, tensor = link.inertia.mass, link.inertia.tensor
     for name in link.missing:
         yield f"{name}; the size of the link is not known"
     if mass < 0.0:
@@ -439,7 +427,7 @@ def _of_link(robot: Robot, link: RobotLink) -> Iterator[str]:
         elif tensor.any():
             yield "an inertia without mass"
         return
-    if problem := tensor_problem(tuple(link.own.moments)):
+    if problem := tensor_problem(tuple(link.inertia.moments)):
         yield problem
     if len(link.points):
         yield from _of_size(link)
@@ -447,13 +435,13 @@ def _of_link(robot: Robot, link: RobotLink) -> Iterator[str]:
 
 def _of_size(link: RobotLink) -> Iterator[str]:
     """Compare mass, centre and inertia with the link's geometry."""
-    mass, centre = link.own.mass, link.own.centre
+    mass, centre = link.inertia.mass, link.inertia.centre
     first, last = link.points.min(axis=0), link.points.max(axis=0)
     diagonal = float(np.linalg.norm(last - first))
     away = float(np.linalg.norm(np.maximum(0.0, np.maximum(first - centre, centre - last))))
     if away > OUTSIDE * diagonal:
         yield f"its centre of mass is {away:.3g} m outside its geometry, {diagonal:.3g} m across"
-    gyration = float(np.sqrt(max(0.0, np.trace(link.own.tensor) / 2.0 / mass)))
+    gyration = float(np.sqrt(max(0.0, np.trace(link.inertia.tensor) / 2.0 / mass)))
     if not SLENDER * diagonal <= gyration <= diagonal:
         yield (
             f"its inertia is too {'large' if gyration > diagonal else 'small'}: a radius of "
@@ -491,6 +479,7 @@ def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
         InputError: the file cannot be read, or has no such link.
     """
     from lxml import etree
+    from lxml.builder import E
 
     try:
         tree = safe_xml(file)
@@ -509,8 +498,7 @@ def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
         material = element.find("visual/material")
         _replace(element, _inertial(link.inertia))
         for kind in () if link.mesh is None else ("visual", "collision"):
-            new = etree.Element(kind)
-            etree.SubElement(etree.SubElement(new, "geometry"), "mesh", filename=link.mesh)
+            new = E(kind, E.geometry(E.mesh(filename=link.mesh)))
             if kind == "visual" and material is not None:
                 new.append(material)
             _replace(element, new)
@@ -535,11 +523,11 @@ def _replace(parent: Any, new: Any) -> None:
 
 
 def _inertial(inertia: Inertia) -> Any:
-    from lxml import etree
+    from lxml.builder import E
 
-    element = etree.Element("inertial")
-    etree.SubElement(element, "origin", xyz=" ".join(map(number, inertia.centre)), rpy="0 0 0")
-    etree.SubElement(element, "mass", value=number(inertia.mass))
     moments = map(number, inertia.tensor[np.triu_indices(3)])
-    etree.SubElement(element, "inertia", **dict(zip(MOMENTS, moments)))
-    return element
+    return E.inertial(
+        E.origin(xyz=" ".join(map(number, inertia.centre)), rpy="0 0 0"),
+        E.mass(value=number(inertia.mass)),
+        E.inertia(dict(zip(MOMENTS, moments))),
+    )

@@ -20,7 +20,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from dolfinopt.exchange.urdf.robot import CELLS, FEWEST, SceneBody, inverse
-from dolfinopt.mesh.solid_cells import boundary
+from dolfinopt.mesh.checks import corner_jacobians
+from dolfinopt.mesh.solid_cells import TENSOR, boundary
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -31,6 +32,8 @@ VOXELS = 1e7  # of a link, at most
 MANY = 300  # pieces of a surface from which on it is filled as it is, not piece by piece
 TINY = 0.02  # of the link's size: smaller pieces (screws, labels) are left out
 SHELL = 128  # voxels along a link on which open pieces are filled
+# Of a filled shell smoothed over a voxel: half a voxel within it, where the surface is on average.
+SURFACE = 0.69
 GAP = 0.02  # of the link's size: half of the widest gap that a closing bridges
 SHORTEST = 0.4  # of the distance between the joints that the geometry must bridge to be cut there
 MARGIN = 0.03  # of that distance, which is cut off where the geometry ends before a joint
@@ -44,11 +47,8 @@ PATCH = 0.04  # share of the outer facets that are an interface where the link i
 LONGEST = 0.9  # of the side of a cell: move of a corner
 EASED = 0.85  # share of a move that is left where it spoils a cell, again and again
 LEAST = 0.15  # of a cube's: Jacobian at a corner of a cell whose corners were moved
-# Corners of a cube in the order of Gmsh's hexahedron.
-CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0],
-                    [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]])  # fmt: skip
-# Neighbours of every corner of a cube, right-handed.
-AROUND = ((1, 3, 4), (2, 0, 5), (3, 1, 6), (0, 2, 7), (7, 5, 0), (4, 6, 1), (5, 7, 2), (6, 4, 3))
+ORDER = TENSOR[8, 3]  # from Gmsh's hexahedron to DOLFINx's, and back
+CORNERS = np.indices((2, 2, 2)).reshape(3, 8)[::-1].T[ORDER]  # of a cube, in Gmsh's order
 
 
 class NoSolid(ValueError):
@@ -77,7 +77,7 @@ class LinkCells:
     @property
     def volume(self) -> float:
         """Volume of the cells, m3."""
-        return float(_jacobians(self.points[self.cells]).mean(axis=1).sum())
+        return float(_jacobians(self.points, self.cells).mean(axis=1).sum())
 
     @property
     def extents(self) -> np.ndarray:
@@ -86,11 +86,10 @@ class LinkCells:
 
     def ends_within(self, distance: float) -> float:
         """Return the volume of the cells whose middle is nearer to an interface, m3."""
-        corners = self.points[self.cells]
         facets = self.points[np.concatenate([self.inboard, self.outboard])]
         places = np.concatenate([facets.reshape(-1, 3), facets.mean(axis=1)])
-        near = cKDTree(places).query(corners.mean(axis=1))[0] < distance
-        return float(_jacobians(corners[near]).mean(axis=1).sum())
+        near = cKDTree(places).query(self.points[self.cells].mean(axis=1))[0] < distance
+        return float(_jacobians(self.points, self.cells[near]).mean(axis=1).sum())
 
     def offset(self, length: float) -> float:
         """Largest distance of an interface's middle from its joint, m."""
@@ -100,41 +99,11 @@ class LinkCells:
         return float(np.linalg.norm(middles, axis=1).max())
 
 
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    """Voxels: the middle of voxel (i, j, k) is low + (i + 1/2, j + 1/2, k + 1/2) step."""
+def _image(shape: tuple[int, ...], step: float, first: np.ndarray) -> Any:
+    """Return PyVista's image whose points are the middles of voxels, the first one at `first`."""
+    import pyvista
 
-    low: np.ndarray
-    step: float
-    shape: tuple[int, int, int]
-
-    @property
-    def image(self) -> Any:
-        """PyVista's image whose points are the middles."""
-        import pyvista
-
-        return pyvista.ImageData(
-            dimensions=self.shape,
-            spacing=(self.step,) * 3,
-            origin=[float(x) + 0.5 * self.step for x in self.low],
-        )
-
-    def filled_by(self, closed: Trimesh) -> np.ndarray:
-        """Return True for the voxels whose middle lies within a closed surface."""
-        import pyvista
-
-        surface = pyvista.wrap(closed)
-        result = surface.voxelize_binary_mask(reference_volume=self.image)["mask"]
-        return np.asarray(result).reshape(self.shape, order="F") > 0
-
-    def passed_by(self, surface: Trimesh) -> np.ndarray:
-        """Return True for the voxels that a surface passes."""
-        fine: Any = surface.subdivide_to_size(0.5 * self.step, max_iter=20)
-        inside = np.floor((fine.vertices - self.low) / self.step).astype(int)
-        inside = inside[((inside >= 0) & (inside < self.shape)).all(axis=1)]
-        result = np.zeros(self.shape, dtype=bool)
-        result[tuple(inside.T)] = True
-        return result
+    return pyvista.ImageData(dimensions=shape, spacing=(step,) * 3, origin=first)
 
 
 def _nearest_places(solid: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,24 +119,19 @@ def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]
     """Return the closed surface of what open pieces enclose, together with closed ones; or none."""
     import trimesh
 
-    corners = np.vstack([piece.bounds for piece in (*left, *closed)])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    step, radius = float((high - low).max()) / SHELL, round(GAP * SHELL)
-    margin = (radius + 2) * step  # a closing needs it, and an opening
-    along, over, through = map(int, np.ceil((high - low + 2.0 * margin) / step))
-    grid = _Grid(low - margin, step, (along, over, through))
-    shell = np.zeros(grid.shape, dtype=bool)
-    for piece in (*closed, *left):
-        shell |= grid.passed_by(piece)
+    whole: Any = trimesh.util.concatenate([*closed, *left])
+    step, radius = float(np.ptp(whole.bounds, axis=0).max()) / SHELL, round(GAP * SHELL)
+    grid, margin = whole.voxelized(step, max_iter=20), radius + 2  # for closing and opening
+    shell = np.pad(grid.matrix, margin)
     shell = ndimage.binary_dilation(shell, iterations=radius)
     shell = ndimage.binary_fill_holes(shell)
     shell = ndimage.binary_erosion(shell, iterations=radius)
     shell = ndimage.binary_opening(shell, iterations=1)  # a sheet encloses nothing
     if not shell.any():
         return []
-    image = grid.image
+    image = _image(shell.shape, step, grid.translation - margin * step)
     image["inside"] = ndimage.gaussian_filter(shell.astype(float), 1.0).ravel(order="F")
-    surface = image.contour([0.5], "inside")
+    surface = image.contour([SURFACE], "inside")
     result = trimesh.Trimesh(surface.points, surface.regular_faces)
     _turn_outwards(result)
     return [result]
@@ -398,6 +362,8 @@ def _cells(
     length: float,
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
+    import pyvista
+
     low, high = piece.bounds.copy()
     side = min(side, float((high - low)[1:].min()) / FEWEST)
     if ends is not None:
@@ -407,9 +373,10 @@ def _cells(
     start = 0.5 * (low + high) - 0.5 * blocks * side
     if blocks.prod() * FINE**3 > VOXELS:
         return None
-    along, over, through = (int(FINE * n) for n in blocks)
-    fine = _Grid(start, side / FINE, (along, over, through))
-    region = fine.filled_by(piece)
+    step, shape = side / FINE, tuple(map(int, FINE * blocks))
+    image = _image(shape, step, start + 0.5 * step)
+    mask = pyvista.wrap(piece).voxelize_binary_mask(reference_volume=image)["mask"]
+    region = np.reshape(mask, shape, order="F") > 0
     pooled = region.reshape(blocks[0], FINE, blocks[1], FINE, blocks[2], FINE).mean(axis=(1, 3, 5))
     if not (pooled >= FULL).any():
         return None
@@ -472,13 +439,12 @@ def _on_surface(
     longest = np.linalg.norm(shift, axis=1, keepdims=True)
     shift *= np.minimum(1.0, LONGEST * side / np.maximum(longest, 1e-30))
     tries = 0
-    while (bad := _jacobians((points + shift)[cells]).min(axis=1) < LEAST * side**3).any():
+    while (bad := _jacobians(points + shift, cells).min(axis=1) < LEAST * side**3).any():
         shift[np.unique(cells[bad])] *= EASED if tries < 20 else 0.0
         tries += 1
     return np.asarray(points + shift)
 
 
-def _jacobians(corners: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (n, 8) at the corners of hexahedra (n, 8, 3), m3."""
-    a, b, c = (corners[:, list(corner)] - corners for corner in zip(*AROUND, strict=True))
-    return np.asarray(np.einsum("nka,nka->nk", a, np.cross(b, c)))
+def _jacobians(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Return the Jacobians (n, 8) at the corners of hexahedra, m3."""
+    return corner_jacobians(points[cells[:, ORDER]])

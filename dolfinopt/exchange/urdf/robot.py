@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -130,7 +130,7 @@ class RobotLink:
 
     Attributes:
         name: of the link.
-        inertia: in the link's frame; None where the file has none.
+        inertia: in the link's frame; zero where the file has none.
         shapes: closed or open surfaces in the link's frame, collision ones if there are any, else
             visual ones.
         missing: a phrase for every mesh file that is not there or cannot be read.
@@ -138,15 +138,10 @@ class RobotLink:
     """
 
     name: str
-    inertia: Inertia | None
+    inertia: Inertia
     shapes: tuple[Trimesh, ...]
     missing: tuple[str, ...] = ()
     visual: Callable[[], tuple[Trimesh, ...]] | None = None
-
-    @property
-    def own(self) -> Inertia:
-        """Its inertia; zero where the file has none."""
-        return MASSLESS if self.inertia is None else self.inertia
 
     @cached_property
     def volume(self) -> float:
@@ -251,16 +246,8 @@ SHORTEST = 1e-3  # m of a solid
 PARALLEL = 1e-6  # sine of the angle between axes
 
 
-class Solid(NamedTuple):
-    """A solid's frame in its link's, its length, the sides of its box, and how they are known.
-
-    Of a rigid body the frame of its link alone; see `SceneBody`.
-    """
-
-    frame: np.ndarray
-    length: float = 0.0
-    size: tuple[float, float] | None = None
-    measured: bool = False
+# A solid's frame in its link's, its length, the sides of its box, and whether these are measured.
+Solid = tuple[np.ndarray, float, tuple[float, float], bool]
 
 
 def solid_of(robot: Robot, name: str, tool: str) -> Solid:
@@ -282,8 +269,8 @@ def solid_of(robot: Robot, name: str, tool: str) -> Solid:
     height, thickness = np.ptp(points[:, 1:], axis=0) if len(points) else (0.0, 0.0)
     if min(height, thickness) <= 0.0:  # no geometry, or a flat one
         side = length / SLENDERNESS
-        return Solid(frame, length, (side, side), False)
-    return Solid(frame, length, (float(height), float(thickness)), True)
+        return frame, length, (side, side), False
+    return frame, length, (float(height), float(thickness)), True
 
 
 def _next_joint(robot: Robot, name: str, tool: str) -> tuple[RobotJoint, np.ndarray]:
@@ -405,17 +392,18 @@ def scene_bodies(
     for link, (body, _) in places.items():
         if link != body:
             continue
-        solid = solid_of(robot, link, tool) if link in chosen else Solid(np.eye(4))
-        joint, frame = robot.holder[link], solid.frame
+        joint, frame, box = robot.holder[link], np.eye(4), ()
+        if link in chosen:
+            frame, *box = solid_of(robot, link, tool)
         parent, at = places[joint.parent]
         outboard = bodies[parent].outboard if parent in bodies else np.eye(4)
         links = tuple(name for name, (other, _) in places.items() if other == link)
         total = MASSLESS
-        for name in (link,) if solid.size else links:
-            total = total + robot.links[name].own.posed(places[name][1])
+        for name in (link,) if box else links:
+            total = total + robot.links[name].inertia.posed(places[name][1])
         pose, axis = inverse(outboard) @ at @ joint.pose @ frame, frame[:3, :3].T @ joint.axis
         inertia = total.posed(inverse(frame))
-        bodies[link] = SceneBody(link, links, joint, parent, pose, axis, inertia, *solid)
+        bodies[link] = SceneBody(link, links, joint, parent, pose, axis, inertia, frame, *box)
     if any(item.parent == tool for item in bodies.values()):
         # A body without mass at the outboard interface of a tool on which others hang.
         name, still = f"{tool}_end", np.eye(4)
@@ -456,7 +444,7 @@ def default_tool(robot: Robot, chosen: tuple[str, ...]) -> str:
 
     def reach(name: str) -> tuple[bool, int, int]:
         joints = robot.path(name)
-        is_frame = not joints[-1].moves and robot.links[name].own.mass == 0.0
+        is_frame = not joints[-1].moves and robot.links[name].inertia.mass == 0.0
         return is_frame, sum(joint.moves for joint in joints), len(joints)
 
     return max(ends, key=reach)
@@ -472,7 +460,7 @@ def places_of(
         body, at = places[joint.parent]
         link = robot.links[joint.child]
         apart = joint.moves or link.name in chosen or link.name == tool
-        if apart or (body in chosen and link.own.mass > 0.0):
+        if apart or (body in chosen and link.inertia.mass > 0.0):
             places[link.name] = (link.name, np.eye(4))
         else:
             places[link.name] = (body, at @ joint.pose)
