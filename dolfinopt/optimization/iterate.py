@@ -118,15 +118,14 @@ class Iterate:
     def _take(self, designs: list[EvaluatedDesign]) -> None:
         """Go on with the designs that x stands for (collective).
 
-        Their smooth limits are held as the mean over the designs so far, of which the newest
-        counts most: where another cell or instant becomes the worst one, they do not leap. Source:
-        Le, Norato, Bruns, Ha & Tortorelli (2010), doi:10.1007/s00158-009-0440-y, eq. (17).
+        Their smooth limits are held as the mean over the designs of the same projection so far, of
+        which the newest counts most: where another cell or instant becomes the worst one, they do
+        not leap. Source: Le, Norato, Bruns, Ha & Tortorelli (2010), doi:10.1007/s00158-009-0440-y,
+        eq. (17).
         """
         at_x = limits_at(self.scene, designs)
-        self.held = [
-            old + LIMITS_MEMORY * (new - old)
-            for old, new in zip(self.held or at_x, at_x, strict=True)
-        ]
+        held = (self.projection.complete and self.held) or at_x
+        self.held = [old + LIMITS_MEMORY * (new - old) for old, new in zip(held, at_x, strict=True)]
         self._set(designs)
         self.progress = self.progress.after(self.problem.values[0], self.problem.excess)
         value, excess = float(self.problem.values[0]), self.problem.excess

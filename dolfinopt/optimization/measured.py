@@ -15,7 +15,7 @@ LEAST_REACH = 0.05  # of the scene's move limit
 # are rounded to another number, with six decimals 0.7; four leave out small moves.
 DECIMALS = 5
 # How much the newest design counts in the scales of limits (Le et al. 2010), 1 without a memory:
-# robust rods end at 0.102 to 0.123 kg from five starts, 0.107 to 0.167 with 1.
+# with that the lightest arms for a stress end 0.7 % heavier, see docs: theory/optimiser.
 LIMITS_MEMORY = 0.3
 STEP_ATTEMPTS = 4  # the last one 1/64 as long
 # For each time step of the last motion, and each of robust designs, before a design is given up;

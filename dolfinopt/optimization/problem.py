@@ -156,7 +156,7 @@ def problem_of(
         designs: at x; of designs without gradients the problem has none either.
         held: smooth limits of every design; by default those of these designs.
     """
-    held = limits_at(scene, designs) if held is None else held
+    held = held or limits_at(scene, designs)
     nominal, robust = designs[-1], len(designs) > 1
     scales = [
         np.array(design.evaluation.smooth_limits) / limits

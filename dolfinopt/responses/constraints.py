@@ -98,7 +98,7 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
     for bound, result in zip(constraints_of(scene), evaluation.responses[1:], strict=True):
         unit_of, lower = bound.response.unit_of, bound.response.declared.lower
         limits += [
-            Limit(bound.name, arm, float(value), float(limit), unit_of(arm), lower)
+            Limit(bound.name, arm, value, float(limit), unit_of(arm), lower)
             for arm, value, limit in zip(
                 result.arms, result.values, bound.limits(result), strict=True
             )
