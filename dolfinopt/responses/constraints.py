@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -98,7 +98,7 @@ def limits_of(scene: Scene, evaluation: Evaluation) -> tuple[Limit, ...]:
     for bound, result in zip(constraints_of(scene), evaluation.responses[1:], strict=True):
         unit_of, lower = bound.response.unit_of, bound.response.declared.lower
         limits += [
-            Limit(bound.name, arm, value, float(limit), unit_of(arm), lower)
+            Limit(bound.name, arm, float(value), float(limit), unit_of(arm), lower)
             for arm, value, limit in zip(
                 result.arms, result.values, bound.limits(result), strict=True
             )
@@ -139,6 +139,6 @@ def tightest(limits: Sequence[Limit]) -> str:
     return f"{worst.words} {100.0 * worst.excess:.3g} % {'below' if worst.least else 'over'} limit"
 
 
-def summary_of(limits: Sequence[Limit]) -> Mapping[str, Any]:
+def summary_of(limits: Sequence[Limit]) -> dict[str, Any]:
     """Return the constraints by name, for summary.json."""
     return {limit.name: limit.to_dict() for limit in limits}
