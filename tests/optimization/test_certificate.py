@@ -321,5 +321,5 @@ def test_same_certificate_on_any_number_of_ranks():
     together, alone = do.optimize(asked), do.optimize(asked, world=MPI.COMM_SELF)
     found, expected = together.certificate, alone.certificate
     assert found.kkt == pytest.approx(expected.kkt, rel=1e-7)
-    assert found.gradient_angle == pytest.approx(expected.angle, rel=1e-7)
+    assert found.gradient_angle == pytest.approx(expected.gradient_angle, rel=1e-7)
     assert together.evaluation.objective == pytest.approx(alone.evaluation.objective, rel=1e-7)
