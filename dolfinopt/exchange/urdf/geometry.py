@@ -173,7 +173,9 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
         if cells is not None:
             return replace(cells, done=(*notes, *_thin_walls(solid, cells)))
         count = round(1.5 * count)
-    raise NoSolid(f"its walls are too thin for {MOST} cells")
+    raise NoSolid(
+        f"its walls are too thin for {MOST} cells; design it as walls: arms.hollow = true"
+    )
 
 
 def _thin_walls(solid: Trimesh, cells: LinkCells) -> list[str]:
