@@ -143,7 +143,7 @@ class _File:
         return self.entities.setdefault(entity, f"#{len(self.entities) + 1}")
 
     def point(self, place: np.ndarray, z: float) -> str:
-        return self.add(f"CARTESIAN_POINT('',{_reals(np.round([*MM * place, z], 6) + 0.0)})")
+        return self.add(f"CARTESIAN_POINT('',({','.join(map(_length, [*MM * place, z]))}))")
 
     def vertex(self, place: np.ndarray, z: float) -> str:
         return self.add(f"VERTEX_POINT('',{self.point(place, z)})")
@@ -172,7 +172,7 @@ class _File:
             return self.line(curve.start, z, np.append(curve.end - curve.start, 0.0))
         if isinstance(curve, Arc):
             axes = self.axes(curve.centre, z)
-            circle = self.add(f"CIRCLE('',{axes},{_real(MM * curve.radius)})")
+            circle = self.add(f"CIRCLE('',{axes},{_length(MM * curve.radius)})")
             return circle, curve.sweep > 0.0
         points = ",".join(self.point(p, z) for p in curve.points)
         knots, counts = np.unique(curve.knots, return_counts=True)
@@ -186,10 +186,9 @@ class _File:
         if isinstance(curve, Line):
             x, y = curve.end - curve.start
             normal, outwards = self.direction(np.array([y, -x, 0.0]))
-            along, _ = self.direction(np.array([x, y, 0.0]))
-            return self.add(f"PLANE('',{self.axes(curve.start, z, f'{normal},{along}')})"), outwards
+            return self.add(f"PLANE('',{self.axes(curve.start, z, f'{normal},$')})"), outwards
         if isinstance(curve, Arc):
-            radius = _real(MM * curve.radius)
+            radius = _length(MM * curve.radius)
             surface = f"CYLINDRICAL_SURFACE('',{self.axes(curve.centre, z)},{radius})"
             return self.add(surface), curve.sweep > 0.0
         direction, _ = self.direction(UP)
@@ -229,7 +228,7 @@ class _File:
         angle = self.add("(NAMED_UNIT(*)PLANE_ANGLE_UNIT()SI_UNIT($,.RADIAN.))")
         solid = self.add("(NAMED_UNIT(*)SI_UNIT($,.STERADIAN.)SOLID_ANGLE_UNIT())")
         accuracy = self.add(
-            f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-06),{length},"
+            f"UNCERTAINTY_MEASURE_WITH_UNIT(LENGTH_MEASURE(1.E-05),{length},"
             "'distance_accuracy_value','accuracy of coordinates')"
         )
         return self.add(
@@ -248,6 +247,11 @@ def _real(value: float) -> str:
     mantissa, *exponent = f"{value:.10g}".split("e")
     mantissa += "" if "." in mantissa else "."
     return "E".join([mantissa, *exponent])
+
+
+def _length(value: float) -> str:
+    """Return a length, mm, to the 1e-5 mm that CAD resolves."""
+    return _real(round(value, 5) + 0.0)
 
 
 def _reals(values: Iterable[float]) -> str:

@@ -69,7 +69,8 @@ def test_step_is_one_solid_of_the_volume(part):
         plane = [face for face in gmsh.model.getEntities(2) if _is_end(gmsh, face)]
         loops = [_loops(gmsh, face) for face in plane]
     assert volume == pytest.approx(1e9 * figures["volume"], rel=1e-6)
-    assert (low[2], high[2]) == pytest.approx((0.0, 10.0), abs=1e-5)
+    # The file is accurate to 1e-5 mm, by which Open CASCADE widens the box.
+    assert (low[2], high[2]) == pytest.approx((0.0, 10.0), abs=2e-5)
     assert loops == [figures["loops"]] * 2
     text = (folder / "arm1.step").read_text()
     assert "PRODUCT('arm1'" in text and text.count("MANIFOLD_SOLID_BREP(") == 1
