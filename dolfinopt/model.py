@@ -176,12 +176,12 @@ class SimulationResult(Result):
 
     def plot_deviation(self) -> Figure | None:
         """Return the figure of the end-effector's distance from its rigid path over time."""
-        from dolfinopt.plots.curves import deviation_of
+        from dolfinopt.plots.curves import deviation_figure
 
         return (
             None
             if self.trajectory is None
-            else deviation_of(self.trajectory, self.initial_deviation)
+            else deviation_figure(self.trajectory, self.initial_deviation)
         )
 
     def plot_design(self) -> Figure | None:
@@ -304,9 +304,9 @@ class OptimizationResult(SimulationResult):
 
     def plot_history(self) -> Figure | None:
         """Return the figure of the objective and other figures over the iterations."""
-        from dolfinopt.plots.curves import history_of
+        from dolfinopt.plots.curves import history_figure
 
-        return history_of(self.scene, self.rows) if self.rows else None
+        return history_figure(self) if self.rows else None
 
 
 Design = Densities | SimulationResult | str | Path | None
