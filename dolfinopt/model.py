@@ -66,8 +66,8 @@ from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.law_variables import LAW, law_values, with_law
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.base import toml_value
 from dolfinopt.scene.tables.objective import GradientKind
-from dolfinopt.scene.toml import toml_value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

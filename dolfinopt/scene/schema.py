@@ -17,7 +17,6 @@ from pydantic.json_schema import GenerateJsonSchema
 from dolfinopt import version
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
-from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, table_in
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
@@ -34,7 +33,7 @@ from dolfinopt.scene.tables.machine import (
     check_machine,
     check_tree,
 )
-from dolfinopt.scene.tables.material import Material, material_keys
+from dolfinopt.scene.tables.material import CATALOGUE, Material, material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction, Simulation
 from dolfinopt.scene.tables.objective import Constraints, Limit, Objective, Scenario
 
@@ -304,7 +303,7 @@ class Scene(Table):
         arm, solid = self.arms[index], self.material
         own = {key: getattr(arm, key, None) for key in material_keys()}  # a law may be newer
         if arm.material is not None:
-            solid = Material(name=arm.material, **CATALOGUE[arm.material].values)
+            solid = Material(name=arm.material, **CATALOGUE[arm.material])
         elif own["kind"] not in (None, solid.kind):
             solid = Material.model_construct(**dict.fromkeys(own))
         given = {key: value for key, value in own.items() if value is not None}
