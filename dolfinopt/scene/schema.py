@@ -30,8 +30,6 @@ from dolfinopt.scene.tables.machine import (
     Force,
     Joint,
     Payload,
-    check_machine,
-    check_tree,
 )
 from dolfinopt.scene.tables.material import CATALOGUE, Material, material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction, Simulation
@@ -349,18 +347,15 @@ class Scene(Table):
 
     def check_table(self) -> None:
         """Let every table check what it and others must agree on."""
-        # Closures first: which joints are driven depends on them; then forces, since an interface
-        # with a wrong name elsewhere seems to be of no use.
-        first = ("closures", "forces")
+        # Closures first: which joints are driven depends on them; then what sits on interfaces,
+        # since one with a wrong name elsewhere seems to be of no use.
+        first = ("closures", "forces", "joints", "payload")
         for key in (*first, *(key for key in type(self).model_fields if key not in first)):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):
                 if isinstance(table, Table):
                     table.check_at(self, (key, i) if tables is value else (key,))
-            if key == "joints" and self.is_spatial:
-                check_tree(self)
-                check_machine(self)
 
 
 # Keys that name a file, as (table, key); a scene holds their absolute paths.
