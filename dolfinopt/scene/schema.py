@@ -222,13 +222,13 @@ class Scene(Table):
         return place_of(self, self.payload.arm or self.arms[-1].name) or (len(self.arms) - 1, 0)
 
     @property
-    def used_interfaces(self) -> frozenset[tuple[int, int]]:
+    def used_interfaces(self) -> set[tuple[int, int]]:
         """Return the interfaces, as of `end_effector`, of joints, forces and the payload."""
         sites = [force.arm for force in self.forces]
         sites += [joint.parent for joint in self.joints]
         sites += [end for closure in self.closures for end in closure.between]
-        places = {place_of(self, site) for site in sites}
-        return frozenset({self.end_effector, *(place for place in places if place is not None)})
+        places = (place_of(self, site) for site in sites)
+        return {self.end_effector, *(place for place in places if place is not None)}
 
     @property
     def dependent_joints(self) -> int:

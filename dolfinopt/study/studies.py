@@ -150,7 +150,7 @@ def tabulated(rows: Iterable[tuple[Mapping[str, Any], Outcome]]) -> pd.DataFrame
 
 def results_of(outcome: Outcome) -> dict[str, Any]:
     """Return results by column, with units, and the outcome itself."""
-    summary = outcome.summary()
+    summary = outcome.summary
     return {
         "label": outcome.case.label,
         COMPLIANCE: outcome.compliance,
@@ -454,7 +454,7 @@ def objective_steps(scene: Scene, kinds: Sequence[str] = ()) -> Steps[Study]:
 
 def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     """Return true values in the motion, efforts by one set of weights, and all designs."""
-    result = [outcome.summary() for outcome in frame["outcome"]]
+    result = [outcome.summary for outcome in frame["outcome"]]
     none = {"": math.nan}
     forces = [np.array([*item.get("drive_rms", none).values()]) for item in result]
     by = 1.0 if weights is None else np.array(weights)

@@ -449,11 +449,9 @@ class Arm(Drive):
             return math.prod(self.cells)
         if (size := self.cell_size) is None:
             return 0
-        if self.is_solid:
-            cubes = self.length * self.height * self.thickness / size**3
-            return round(6.0 * cubes if self.cell_shape == "tetrahedron" else cubes)
-        squares = self.length * self.height / size**2
-        return round(2.0 * squares if self.cell_shape == "triangle" else squares)
+        sizes = (self.length, self.height, self.thickness)[: 3 if self.is_solid else 2]
+        simplices = {"tetrahedron": 6.0, "triangle": 2.0}.get(self.shape, 1.0)
+        return round(simplices * math.prod(sizes) / size ** len(sizes))
 
     @property
     def nodes_per_cell(self) -> float:
