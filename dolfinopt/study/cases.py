@@ -151,11 +151,6 @@ class Outcome:
         return [f"{case.label}, sample {names[k]}: {text}" for k, text in self.messages.items()]
 
     @property
-    def stopped(self) -> str:
-        """Why an optimisation stopped."""
-        return self.stop_reason if self.case.action == "optimize" else ""
-
-    @property
     def design(self) -> Path:
         """Path of the design.npz."""
         return self.folder / "design.npz"
