@@ -66,8 +66,8 @@ from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.law_variables import LAW, law_values, with_law
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.base import toml_value
 from dolfinopt.scene.tables.objective import GradientKind
-from dolfinopt.scene.toml import toml_value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -664,7 +664,7 @@ class Model:
             InputError: something asked for is not possible.
         """
         from dolfinopt.study.cases import Runner  # with pandas: a third of the import's time
-        from dolfinopt.study.studies import carry_out, study
+        from dolfinopt.study.studies import study
 
         with self._folder(folder) as place:
             paths = [
@@ -673,7 +673,7 @@ class Model:
             ]
             runner = Runner(place, self._world, shown)
             steps = study(self.scene, preset, vary, paths, reoptimize=reoptimize)
-            frame: DataFrame = carry_out(steps, runner).tables[0].frame
+            frame: DataFrame = runner.follow(steps).tables[0].frame
         return frame
 
     # -- designs over the ranks ----------------------------------------------------------------

@@ -132,14 +132,14 @@ def draw(result: Result, folder: Path, views: list[ArmView], *, animation: bool 
         draw_motion(folder / "motion.gif", views, make_film(trajectory))
 
 
-def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
-    if choice is not None and world.rank == 0:
+def tell(choice: OrderSelection | None) -> None:
+    if choice is not None:
         click.echo(chosen(choice.coordinates, choice.error))
 
 
-def tell_assumed(world: MPI.Comm, scene: Scene) -> None:
+def tell_assumed(scene: Scene) -> None:
     """Print in one line what the scene does not state and its results depend on."""
-    if world.rank == 0 and (line := assumed(scene)):
+    if line := assumed(scene):
         click.echo(line)
 
 
