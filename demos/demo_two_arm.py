@@ -8,7 +8,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 import dolfinopt as do
-from dolfinopt.plots.curves import deviation_figure, history_of
+from dolfinopt.plots.curves import deviation_figure, history_figure
 from dolfinopt.plots.design import design_figure
 from dolfinopt.plots.style import save
 
@@ -39,10 +39,9 @@ def main(folder: Path = Path("results/demo_two_arm")) -> do.Result:
     # Plot on the root, which alone has the whole arms and the motion.
     if world.rank == 0:
         folder.mkdir(parents=True, exist_ok=True)
-        motion = result.trajectory
         save(design_figure(views, scene.name), folder / "design.png")
-        save(history_of(scene, result.history), folder / "history.png")
-        figure = deviation_figure(motion.t, motion.deviation, result.initial_deviation)
+        save(history_figure(result), folder / "history.png")
+        figure = deviation_figure(result.trajectory, result.initial_deviation)
         save(figure, folder / "deviation.png")
         for name, one in (("initial", initial), ("optimised", final)):
             print(

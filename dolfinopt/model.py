@@ -66,8 +66,8 @@ from dolfinopt.responses.response import needs
 from dolfinopt.responses.stress_report import stress_report
 from dolfinopt.scene.law_variables import LAW, law_values, with_law
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.base import toml_value
 from dolfinopt.scene.tables.objective import GradientKind
-from dolfinopt.scene.toml import toml_value
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -176,12 +176,12 @@ class SimulationResult(Result):
 
     def plot_deviation(self) -> Figure | None:
         """Return the figure of the end-effector's distance from its rigid path over time."""
-        from dolfinopt.plots.curves import deviation_of
+        from dolfinopt.plots.curves import deviation_figure
 
         return (
             None
             if self.trajectory is None
-            else deviation_of(self.trajectory, self.initial_deviation)
+            else deviation_figure(self.trajectory, self.initial_deviation)
         )
 
     def plot_design(self) -> Figure | None:
@@ -304,9 +304,9 @@ class OptimizationResult(SimulationResult):
 
     def plot_history(self) -> Figure | None:
         """Return the figure of the objective and other figures over the iterations."""
-        from dolfinopt.plots.curves import history_of
+        from dolfinopt.plots.curves import history_figure
 
-        return history_of(self.scene, self.rows) if self.rows else None
+        return history_figure(self) if self.rows else None
 
 
 Design = Densities | SimulationResult | str | Path | None
@@ -664,7 +664,7 @@ class Model:
             InputError: something asked for is not possible.
         """
         from dolfinopt.study.cases import Runner  # with pandas: a third of the import's time
-        from dolfinopt.study.studies import carry_out, study
+        from dolfinopt.study.studies import study
 
         with self._folder(folder) as place:
             paths = [
@@ -673,7 +673,7 @@ class Model:
             ]
             runner = Runner(place, self._world, shown)
             steps = study(self.scene, preset, vary, paths, reoptimize=reoptimize)
-            frame: DataFrame = carry_out(steps, runner).tables[0].frame
+            frame: DataFrame = runner.follow(steps).tables[0].frame
         return frame
 
     # -- designs over the ranks ----------------------------------------------------------------

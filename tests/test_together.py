@@ -336,10 +336,10 @@ def test_samples(monkeypatch, shared_tmp_path):
 
 @ON_RANKS
 def test_tables(monkeypatch, shared_tmp_path):
-    fail_on(monkeypatch, 0, study, "tabulated")
+    fail_on(monkeypatch, 0, study, "results_of")
     steps = study.study(coarse(), None, ["payload.mass=5,6"], [])
-    with pytest.raises(Unusual, match=r"^tabulated$"):
-        study.carry_out(steps, Runner(shared_tmp_path, COMM, False))
+    with pytest.raises(Unusual, match=r"^results_of$"):
+        Runner(shared_tmp_path, COMM, False).follow(steps)
     COMM.Barrier()
 
 

@@ -110,7 +110,7 @@ def _export_bodies(
     place = arms_with_design(world, scene, design, Profile())
     scene, partition, arms, x_phys = place
     on_root(world, prepare_folder, folder)
-    tell(world, choose_coordinates(*place, Profile()))
+    tell(choose_coordinates(*place, Profile()))
     with together(world):
         for k, arm in arms.items():
             arm.state(x_phys[k])
@@ -151,7 +151,7 @@ def _export_state_space(
     claim(world, folder, overwrite, STATE_SPACE, scene=scene)
     profile = Profile()
     place = arms_with_design(world, scene, design, profile)
-    tell(world, choose_coordinates(*place, profile))
+    tell(choose_coordinates(*place, profile))
     model = linearised_machine(*place, at, profile, below=below)
     on_root(world, prepare_folder, folder)
     with together(world):

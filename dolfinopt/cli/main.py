@@ -23,10 +23,10 @@ from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
 from dolfinopt.interrupt import launched_rank
 from dolfinopt.output.folders import check_new, write_files
-from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.messages import KeyInfo, describe_keys
 from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
 from dolfinopt.scene.tables.base import Refusal
+from dolfinopt.scene.tables.material import CATALOGUE, SOURCES
 from dolfinopt.version import __version__
 
 # -- `dolfinopt init` ----------------------------------------------------------------------------
@@ -123,10 +123,10 @@ def _materials(pattern: str | None, infos: list[KeyInfo]) -> list[str]:
     asked = any(info.key == "material.name" for info in infos)
     word = pattern.casefold()
     rows = [
-        f"{name:<24}{_in_units(material.young_modulus, 1e9):>9} GPa{material.poisson_ratio:>7.3g}"
-        f"{material.density:>7.0f} kg/m3{_in_units(material.yield_strength, 1e6):>6} MPa  "
-        f"{material.source}"
-        for name, material in CATALOGUE.items()
+        f"{name:<24}{_in_units(values['young_modulus'], 1e9):>9} GPa"
+        f"{values['poisson_ratio']:>7.3g}{values['density']:>7.0f} kg/m3"
+        f"{_in_units(values.get('yield_strength'), 1e6):>6} MPa  {SOURCES[name]}"
+        for name, values in CATALOGUE.items()
         if asked or word in name.casefold()
     ]
     head = f"{'material':<24}{'Young':>13}{'Poisson':>8}{'density':>12}{'yield':>10}  source"

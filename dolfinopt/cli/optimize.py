@@ -55,7 +55,7 @@ def optimize(
         raise InputError("--resume, --overwrite: expected only one of them")
     loaded = load(world, scene, overrides)
     loaded.check_designed()
-    tell_assumed(world, loaded)
+    tell_assumed(loaded)
     folder = out or Path("results") / scene.stem
     if resume:
         on_root(world, checkpoint.check, folder, loaded)
@@ -119,7 +119,7 @@ def simulate(
 ) -> None:
     """Simulate a scene with a given design, and tell what it does."""
     loaded = load(world, scene, overrides)
-    tell_assumed(world, loaded)
+    tell_assumed(loaded)
     folder = out or Path("results") / f"{scene.stem}-simulation"
     claim(world, folder, overwrite, scene=loaded)
     profile = Profile()
@@ -158,34 +158,31 @@ def gradient(
     place = arms_with_design(world, loaded, design, profile)
     on_root(world, prepare_folder, out.parent)
     if needs(loaded, "motion"):
-        tell(world, choose_coordinates(*place, profile))
+        tell(choose_coordinates(*place, profile))
     result, trajectory = evaluation.evaluate(*place, profile, simulated=False)
     by_cell = evaluation.gradient(*place[:3], trajectory, profile)
     write_gradient(out, *place[:3], by_cell, result.objective)
-    if world.rank == 0:
-        unit = loaded.objective.response.unit
-        name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
-        value = with_unit(f"{result.objective:.6g}", unit)
-        click.echo(f"objective {value}; {name} gradient in {out}")
+    name = loaded.objective.gradient if loaded.objective.has_esl_gradient else "exact"
+    value = with_unit(f"{result.objective:.6g}", loaded.objective.response.unit)
+    click.echo(f"objective {value}; {name} gradient in {out}")
     if check:
-        _check_gradient(world, place, profile)
+        _check_gradient(place, profile)
 
 
-def _check_gradient(world: MPI.Comm, place: Designed, profile: Profile) -> None:
+def _check_gradient(place: Designed, profile: Profile) -> None:
     """Print the Taylor test; raise ConvergenceError where a rate is too low."""
     test = taylor_test(Evaluator(*place[:3], profile), place.x_phys)
-    if world.rank == 0:
-        steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
-        click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")
-        for row in test.rows:
-            remainders = "".join(f"{r:12.2e}" for r in row.remainders)
-            slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
-            click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
-        if place.scene.objective.has_esl_gradient:
-            click.echo(
-                f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
-                f"{test.ratio:.3f} times as long"
-            )
+    steps = "".join(f"{f'h = {h:.2g}':>12}" for h in STEPS)
+    click.echo(f"{'direction':<22}{'exact slope':>13}{'frozen':>13}{steps}{'rate':>7}")
+    for row in test.rows:
+        remainders = "".join(f"{r:12.2e}" for r in row.remainders)
+        slopes = f"{row.slope:13.4e}{row.slope_frozen:13.4e}"
+        click.echo(f"{row.direction:<22}{slopes}{remainders}{row.rate:7.2f}")
+    if place.scene.objective.has_esl_gradient:
+        click.echo(
+            f"gradient with frozen loads: {test.angle:.1f} degrees from the exact one, "
+            f"{test.ratio:.3f} times as long"
+        )
     if not test.passed:
         raise ConvergenceError(
             f"the Taylor remainders fall at a rate below {PASSING_RATE}: the gradient is not exact "

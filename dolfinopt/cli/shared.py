@@ -99,9 +99,9 @@ def _instead(folder: Path) -> str:
 def draw(result: Result, folder: Path, views: list[ArmView], *, animation: bool = False) -> None:
     """Draw all pictures of a run (root only); the animation where it is asked for."""
     from dolfinopt.plots.curves import (
-        deviation_of,
+        deviation_figure,
         drives_figure,
-        history_of,
+        history_figure,
         law_figure,
         limits_figure,
     )
@@ -109,7 +109,7 @@ def draw(result: Result, folder: Path, views: list[ArmView], *, animation: bool 
     from dolfinopt.plots.machine import draw_motion, machine_figure, make_film
     from dolfinopt.plots.style import save
 
-    scene, trajectory, history = result.scene, result.trajectory, result.rows
+    scene, trajectory = result.scene, result.trajectory
     assert trajectory is not None
     title, bodies = scene.name, trajectory.mechanism.arms
     if arms := designed(views):
@@ -118,12 +118,12 @@ def draw(result: Result, folder: Path, views: list[ArmView], *, animation: bool 
     if stressed := [view for view in views if view.stress is not None]:
         save(stress_figure(stressed, title), folder / "stress.png")
     save(machine_figure(views, trajectory, title), folder / "machine.png")
-    if history:
-        save(history_of(scene, history), folder / "history.png")
-        if (limits := limits_figure(scene, history)) is not None:
+    if result.rows:
+        save(history_figure(result), folder / "history.png")
+        if (limits := limits_figure(result)) is not None:
             save(limits, folder / "limits.png")
     if not scene.is_pinned:
-        save(deviation_of(trajectory, result.initial_deviation), folder / "deviation.png")
+        save(deviation_figure(trajectory, result.initial_deviation), folder / "deviation.png")
     if trajectory.is_machine:
         save(drives_figure(trajectory), folder / "drives.png")
     if scene.motion.coefficients:
@@ -132,14 +132,14 @@ def draw(result: Result, folder: Path, views: list[ArmView], *, animation: bool 
         draw_motion(folder / "motion.gif", views, make_film(trajectory))
 
 
-def tell(world: MPI.Comm, choice: OrderSelection | None) -> None:
-    if choice is not None and world.rank == 0:
+def tell(choice: OrderSelection | None) -> None:
+    if choice is not None:
         click.echo(chosen(choice.coordinates, choice.error))
 
 
-def tell_assumed(world: MPI.Comm, scene: Scene) -> None:
+def tell_assumed(scene: Scene) -> None:
     """Print in one line what the scene does not state and its results depend on."""
-    if world.rank == 0 and (line := assumed(scene)):
+    if line := assumed(scene):
         click.echo(line)
 
 

@@ -20,7 +20,7 @@ from dolfinopt.parallel import on_root
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import file_digest, with_digests
 from dolfinopt.study.cases import Runner, Steps
-from dolfinopt.study.studies import carry_out, study, sweep_name
+from dolfinopt.study.studies import study, sweep_name
 from dolfinopt.study.tables import Study, write_study
 
 # What a command asks: name of the study's files, design.npz files, the study's steps in a folder,
@@ -54,7 +54,8 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
         asked = {"scene": with_digests(loaded.to_dict()), "designs": known} | question
         if not overwrite:
             on_root(world, _check_question, folder, name, asked)
-        done = carry_out(steps(folder), Runner(folder, world, keep=keep))
+        runner = Runner(folder, world, keep=keep)
+        done = runner.follow(steps(folder))
 
         def conclude() -> None:
             remove_stale(folder, listed_files(folder / f"{name}.json"))
@@ -65,7 +66,7 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
                 written += draw_study(done, folder)
             _write_question(folder, name, asked, [path.name for path in written])
             click.echo(done.markdown())
-            click.echo(f"{done.computed} cases computed; tables and pictures in {folder}")
+            click.echo(f"{runner.computed} cases computed; tables and pictures in {folder}")
 
         on_root(world, conclude)  # a rank that raised below meanwhile would end its writing
         if done.failures:
@@ -203,9 +204,8 @@ def _check_field(
     for case in chosen_cases(names, records is not None):
         checked = on_root(world, check, case, records)
         result += checked
-        if world.rank == 0:
-            table = table_of(checked).drop(columns="case").to_string(index=False)
-            click.echo(f"{case.title} ({case.name})\n{table}\n")
+        table = table_of(checked).drop(columns="case").to_string(index=False)
+        click.echo(f"{case.title} ({case.name})\n{table}\n")
     if out is not None:
         on_root(world, prepare_folder, out)
         on_root(world, write_text, out / "field.csv", table_of(result).to_csv(index=False))
@@ -215,8 +215,7 @@ def _check_field(
         raise ConvergenceError(
             f"bench field: {len(missed)} of {len(result)} limits missed: {named}"
         )
-    if world.rank == 0:
-        click.echo(f"{len(result)} values within their limits")
+    click.echo(f"{len(result)} values within their limits")
 
 
 def _measure(world: MPI.Comm, names: tuple[str, ...], out: Path | None, quick: bool) -> None:

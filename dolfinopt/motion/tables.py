@@ -56,7 +56,7 @@ def curve_through(rows: Rows, motion: Motion) -> tuple[Curve, bool]:
 
 def is_free(motion: Motion) -> bool:
     """Return whether a table with times is followed by a spline: no law, no limits."""
-    return motion.law == Motion.model_fields["law"].default and not limits_of(motion).any
+    return motion.law == Motion.model_fields["law"].default and limits_of(motion) == Limits()
 
 
 def _stop_to_stop(motion: Motion, rows: Rows) -> Curve:

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 class ArmView:
     """One whole arm on the root, cells in the order of their centroids.
 
+    Arms without a design, rigid ones and those from a file, have no cells.
+
     Attributes:
         name: the arm's.
         corners: (n_cells, 3 or 4, 2) m, around each cell; of solids (n_cells, 4 or 8, 3), as VTK
@@ -46,7 +48,6 @@ class ArmView:
         centroid: (n_cells, d) m.
         density: (n_cells,) physical densities.
         modes: (n_cells, corners, d, q) the reduced basis at the corners; q = 0 if not reduced.
-        designed: False for arms without a design: rigid ones and those from a file.
         length: from joint axis to joint axis, m; None if not known.
         regions: what the scene keeps solid or void: kind and outline (n, 2), m, of every region.
         stress: (n_cells,) largest von Mises stress along the motion, Pa; None if not known.
@@ -61,13 +62,17 @@ class ArmView:
     centroid: np.ndarray
     density: np.ndarray
     modes: np.ndarray
-    designed: bool = True
     length: float | None = None
     regions: tuple[tuple[str, np.ndarray], ...] = ()
     stress: np.ndarray | None = None
     stress_instant: np.ndarray | None = None
     filtered: np.ndarray | None = None
     wall: np.ndarray | None = None
+
+    @property
+    def designed(self) -> bool:
+        """Whether it has a design."""
+        return len(self.density) > 0
 
     @property
     def solid(self) -> np.ndarray:
@@ -120,7 +125,8 @@ def _views(
     for index, owner in enumerate(scene.owners):
         keys = scene.arms[index]
         if owner is None:
-            views.append(_undesigned_view(keys, scene.dimension))
+            none = np.zeros((0, 2**scene.dimension, scene.dimension))
+            views.append(ArmView(keys.name, none, none[:, 0], none[:, 0, 0], none[..., None]))
             continue
         order = canonical_order(cells[owner]["centroid"])
         own = {name: values[order] for name, values in cells[owner].items()}
@@ -157,15 +163,6 @@ def _outlines(scene: Scene, index: int) -> tuple[tuple[str, np.ndarray], ...]:
             points = np.array(shape.exterior.coords) * scale * [1.0, mirror]
             outlines.append((region.kind, points))
     return tuple(outlines)
-
-
-def _undesigned_view(arm: ArmKeys, dimension: int) -> ArmView:
-    """Return an arm without a design as one box from joint to joint, undeformed."""
-    unit = np.indices((2,) * dimension).reshape(dimension, -1)[::-1].T
-    unit = unit[TENSOR[2**dimension, dimension]] - [0.0, 0.5, 0.5][:dimension]
-    corners = unit * [arm.length, arm.height, arm.thickness][:dimension]
-    modes, centroid = np.zeros((1, *corners.shape, 0)), corners.mean(axis=0)
-    return ArmView(arm.name, corners[None], centroid[None], np.ones(1), modes, False, arm.length)
 
 
 def canonical_order(points: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
+from dolfinopt.data import tomllib
 from dolfinopt.disk import finite
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.multibody.loads import Stiffening
@@ -34,7 +35,6 @@ from dolfinopt.responses.products import by_nodes
 from dolfinopt.responses.response import Analysis
 from dolfinopt.responses.stress_report import ArmStress, Peak, stress_report, unjudged
 from dolfinopt.scene.load import Scene, scene_from_dict
-from dolfinopt.scene.toml import tomllib
 
 if TYPE_CHECKING:
     from pandas import DataFrame

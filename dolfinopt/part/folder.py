@@ -22,7 +22,7 @@ from dolfinopt.output.checkpoint import unpickled
 from dolfinopt.output.folders import PARTS_LIST, prepare_folder, record_of_parts, remove_stale
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.schema import with_relative_paths
-from dolfinopt.scene.toml import toml_value
+from dolfinopt.scene.tables.base import toml_value
 from dolfinopt.version import NUMERICS, __version__
 
 if TYPE_CHECKING:

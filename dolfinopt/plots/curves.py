@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from typing import TYPE_CHECKING
 
@@ -10,21 +10,20 @@ import numpy as np
 
 from dolfinopt.motion.build import rests
 from dolfinopt.multibody.kinematics import lengths
-from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.trajectory import drive_units, free_drives
 from dolfinopt.plots.panels import Limit as Bound
 from dolfinopt.plots.panels import Line, Panel, panel_figure
 from dolfinopt.plots.style import INITIAL, MILLI, OPTIMISED, look, looks
 from dolfinopt.progress import SHOWN
-from dolfinopt.responses.constraints import Limit
-from dolfinopt.responses.response import constraints_of
 from dolfinopt.scene.duration import path_length, time_law
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from dolfinopt.dynamics.build import Trajectory
+    from dolfinopt.optimization.result import Result
     from dolfinopt.part.check import Check
+    from dolfinopt.responses.constraints import Limit
     from dolfinopt.scene.load import Scene
 
 DEVIATION = "Deviation of the end-effector from the rigid path"
@@ -45,26 +44,17 @@ HISTORY = {
     "merit": ("merit: objective and excesses of limits [-]", 1.0),
 }
 SHARES = ("grayness", "volume fraction")  # from 0 to 1, on one linear scale, also arm by arm
-Limits = Mapping[str, Limit]  # by their columns of history.csv, see `limits_by_column`
 
 
-def history_of(scene: Scene, rows: Sequence[HistoryRow]) -> Figure:
-    """Return the picture of `history_figure` of a scene's optimisation, with its limits."""
-    minimised = scene.objective.response
-    limits = limits_by_column(scene, rows[0].constraints)
-    return history_figure(rows, f"{minimised.label} [{minimised.unit}]", limits)
-
-
-def history_figure(rows: Sequence[HistoryRow], objective_label: str, limits: Limits) -> Figure:
+def history_figure(result: Result) -> Figure:
     """Return the picture of what history.csv holds against the iteration.
 
     Down the first column, then down the second; what is nowhere known is left out.
 
     Args:
-        rows: at least one.
-        objective_label: name and unit of the objective.
-        limits: of the constraints.
+        result: of an optimisation, with at least one row.
     """
+    rows, limits, minimised = result.rows, _limits_told(result), result.scene.objective.response
     iteration = np.array([row.iteration for row in rows])
 
     def panel(
@@ -79,13 +69,14 @@ def history_figure(rows: Sequence[HistoryRow], objective_label: str, limits: Lim
         line = Line("", iteration, y)
         return Panel(label, "iteration", "", (line,), y_log=not is_share, note=ends, limits=bounds)
 
-    panels = [panel(objective_label, [row.objective for row in rows])]
+    label = f"{minimised.label} [{minimised.unit}]"
+    panels = [panel(label, [row.objective for row in rows])]
     for name, (label, factor) in HISTORY.items():
-        if name != "max_deviation" or "deviation" not in limits:  # a panel of the same values
+        if name != "max_deviation" or "deviation" not in rows[0].constraints:  # the same values
             panels.append(panel(label, [getattr(row, name) for row in rows], factor))
-    for name, limit in limits.items():
+    for limit in limits:
         unit, factor = SHOWN.get(limit.unit, (limit.unit, 1.0))
-        values = [row.constraints.get(name, np.nan) for row in rows]
+        values = [row.constraints[limit.name] for row in rows]
         panels.append(panel(f"{limit.words} [{unit}]", values, factor, limit.limit))
     known = [item for item in panels if item.note]
     half = -(-len(known) // 2)
@@ -93,25 +84,28 @@ def history_figure(rows: Sequence[HistoryRow], objective_label: str, limits: Lim
     return panel_figure("History of the optimisation", list(pairs), height=2.1)
 
 
-def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
+def limits_figure(result: Result) -> Figure | None:
     """Return the picture of how far limits are used, and what they cost.
 
     Above, the share of every limit that is used over the iterations: of a lower limit it is the
     limit over the value. Below, by how many per cent the objective would be better for each per
     cent by which the limit is eased: the multiplier over the objective. None where the material
     alone is limited.
+
+    Args:
+        result: of an optimisation, with at least one row.
     """
-    limits = limits_by_column(scene, rows[0].constraints)
-    if all(limit.of_mass for limit in limits.values()):
+    rows, limits = result.rows, _limits_told(result)
+    if all(limit.of_mass for limit in limits):
         return None
     iteration = np.array([row.iteration for row in rows])
     objective = np.array([abs(row.objective) or 1.0 for row in rows])
     used, eased = [], []
-    for name, limit in limits.items():
-        value = np.array([row.constraints[name] for row in rows])
+    for limit in limits:
+        value = np.array([row.constraints[limit.name] for row in rows])
         share = 100.0 * (limit.limit / value if limit.least else value / limit.limit)
         used.append(Line(limit.words, iteration, share))
-        gained = np.array([row.multipliers.get(name, np.nan) for row in rows]) / objective
+        gained = np.array([row.multipliers.get(limit.name, np.nan) for row in rows]) / objective
         eased.append(Line("", iteration, gained))
     above = Panel("share of the limit that is used [%]", "iteration", "", tuple(used), y_log=True,
                   note="limit: 100 %", limits=((100.0, iteration[0], iteration[-1]),))  # fmt: skip
@@ -120,13 +114,12 @@ def limits_figure(scene: Scene, rows: Sequence[HistoryRow]) -> Figure | None:
     return panel_figure("Limits of the design", [[above], [below]], width=WIDE)
 
 
+def _limits_told(result: Result) -> list[Limit]:
+    """Return the limits that the history tells of: not that of earlier versions."""
+    return [limit for limit in result.limits if limit.name in result.rows[0].constraints]
+
+
 # -- deviation -------------------------------------------------------------------------------
-
-
-def deviation_of(trajectory: Trajectory, initial: np.ndarray | None) -> Figure:
-    """Return the picture of `deviation_figure` of a motion, with its scene's limits."""
-    title, limits = deviation_title(trajectory), deviation_limits(trajectory.scene)
-    return deviation_figure(trajectory.t, trajectory.deviation, initial, title, limits)
 
 
 def deviation_title(trajectory: Trajectory) -> str:
@@ -137,32 +130,23 @@ def deviation_title(trajectory: Trajectory) -> str:
     return "Deviation of the end-effector from the desired path" if controlled else DEVIATION
 
 
-def deviation_figure(
-    t: np.ndarray,
-    deviation: np.ndarray,
-    initial: np.ndarray | None = None,
-    title: str = DEVIATION,
-    limits: Sequence[Bound] = (),
-) -> Figure:
+def deviation_figure(trajectory: Trajectory, initial: np.ndarray | None = None) -> Figure:
     """Return the picture of the end-effector's distance from its rigid or desired path.
 
     Args:
-        t: (n,) s.
-        deviation: (n, d) m.
+        trajectory: the motion.
         initial: (m, d) m, of the initial design, evenly over the same time, or None.
-        title: above the picture, of what from what.
-        limits: m, each with the first and the last instant at which it holds, s.
     """
-    lines = [_distance("", t, lengths(deviation))]
+    t, limits = trajectory.t, deviation_limits(trajectory.scene)
+    lines = [_distance("", t, trajectory.distance)]
     if initial is not None and len(initial):
         even = np.linspace(t[0], t[-1], len(initial))
-        lines = [
-            _distance(INITIAL, even, lengths(initial)),
-            _distance(OPTIMISED, t, lengths(deviation)),
-        ]
+        before = _distance(INITIAL, even, lengths(initial))
+        lines = [before, _distance(OPTIMISED, t, trajectory.distance)]
     # The only curve looks as that of the optimised design.
     styles = {line.label: look(len(lines) - 1 - k) for k, line in enumerate(lines)}
-    return panel_figure(title, [[_deviations(lines, limits)]], styles, 4.5, WIDE)
+    panel = _deviations(lines, limits)
+    return panel_figure(deviation_title(trajectory), [[panel]], styles, 4.5, WIDE)
 
 
 def _distance(name: str, t: np.ndarray, distance: np.ndarray) -> Line:
@@ -257,20 +241,7 @@ def law_figure(scene: Scene) -> Figure:
     return panel_figure("Law along the path", rows, width=WIDE)
 
 
-# -- limits by the columns of the history, and over time ----------------------------------------
-
-
-def limits_by_column(scene: Scene, values: Mapping[str, float]) -> dict[str, Limit]:
-    """Return the limits of constraints whose values are given by their columns of history.csv."""
-    result: dict[str, Limit] = {}
-    for item in constraints_of(scene):
-        key, lower = item.name, item.response.declared.lower
-        own = [column for column in values if column == key or column.startswith(f"{key}_")]
-        for column, limit in zip(own, np.broadcast_to(item.limit, len(own)), strict=True):
-            arm = column[len(key) + 1 :]
-            unit = item.response.unit_of(arm)
-            result[column] = Limit(key, arm, values[column], float(limit), unit, lower)
-    return result
+# -- limits over time ---------------------------------------------------------------------------
 
 
 def deviation_limits(scene: Scene) -> list[Bound]:

@@ -50,7 +50,7 @@ class PlaneStage:
             title: above the figure.
         """
         self.views, self.poses, size = views, poses, poses.size
-        self.rims = [boundary(view.corners) for view in views]
+        self.rims = {k: boundary(view.corners) for k, view in enumerate(views) if view.designed}
         self.stands = np.ptp(poses.held[:, 0], axis=0).max() == 0.0
         points = np.concatenate([poses.reached(views), *paths])
         low, high = points.min(axis=0) - ROOM * size, points.max(axis=0) + ROOM * size

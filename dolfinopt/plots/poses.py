@@ -94,6 +94,8 @@ class Poses:
         d = self.end.shape[1]
         points = [self.origin, self.outboard, self.held, self.tied, self.end]
         for i, view in enumerate(views):
+            if not view.designed:
+                continue
             low, high = view.corners.min(axis=(0, 1)), view.corners.max(axis=(0, 1))
             box = np.einsum("nij,pj->npi", self.rotation[:, i], box_corners(low, high))
             points.append(self.origin[:, None, i] + box)

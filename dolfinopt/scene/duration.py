@@ -22,7 +22,7 @@ def time_law(motion: Motion) -> Law:
     Raises:
         InputError: the table cannot be used.
     """
-    length = path_length(motion) if limits_of(motion).any else 1.0
+    length = 1.0 if limits_of(motion) == Limits() else path_length(motion)
     law = known_law(motion.law, length, limits_of(motion), motion.acceleration_share)
     return shaped(law, motion.coefficients) if any(motion.coefficients) else law
 
@@ -60,7 +60,7 @@ def least_duration(motion: Motion) -> tuple[float | None, bool]:
         if last is not None:
             return last, False
     limits = limits_of(motion)
-    if not limits.any:
+    if limits == Limits():
         return None, False
     return known_law(motion.law, path_length(motion), limits, motion.acceleration_share).least, True
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Legendre, Polynomial
@@ -29,18 +30,12 @@ POWERS = {"quintic": 2, "septic": 3}  # of u (1 - u), which the speed is proport
 LARGEST = {"quintic": (15 / 8, 10 / sqrt(3), 60.0), "septic": (35 / 16, 84 / sqrt(125), 52.5)}
 
 
-@dataclass(frozen=True)
-class Limits:
+class Limits(NamedTuple):
     """What a drive does at most along the path: m/s, m/s2, m/s3; inf without a limit."""
 
     speed: float = inf
     acceleration: float = inf
     jerk: float = inf
-
-    @property
-    def any(self) -> bool:
-        """Whether there is one."""
-        return min(self.speed, self.acceleration, self.jerk) < inf
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
 from dolfinopt.scene import inheritance
 from dolfinopt.scene.derived import complete
-from dolfinopt.scene.materials import CATALOGUE, unknown_material
 from dolfinopt.scene.messages import (
     Override,
     blamed,
@@ -32,7 +31,8 @@ from dolfinopt.scene.overrides import override
 from dolfinopt.scene.schema import Scene, check_scene_name, named_files
 from dolfinopt.scene.tables.arms import SIZE_KEYS, Arm
 from dolfinopt.scene.tables.base import Refusal, input_error, loc_of, shown
-from dolfinopt.scene.toml import read_toml
+from dolfinopt.scene.tables.material import CATALOGUE
+from dolfinopt.scene.text import read_toml
 
 __all__ = [
     "Arm",
@@ -56,7 +56,7 @@ def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> S
         InputError: one line that names file, key, value and what is allowed.
     """
     source = os.fspath(path)
-    return _build(read_toml(source), source, overrides, _default_name(source))
+    return _build(read_toml(source), source, overrides)
 
 
 def scene_from_dict(
@@ -71,7 +71,7 @@ def scene_from_dict(
     """
     if not isinstance(data, Mapping):
         raise input_error(source, f"expected a table of scene keys, found {shown(data)}")
-    return _build(data, source, overrides, _default_name(source))
+    return _build(data, source, overrides)
 
 
 def _default_name(source: str) -> str:
@@ -82,10 +82,10 @@ def _default_name(source: str) -> str:
         return "scene"
 
 
-def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name: str) -> Scene:
-    """Complete `data`, apply `overrides`, validate; `name` is the default of the scene's name."""
+def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str]) -> Scene:
+    """Complete `data`, apply `overrides`, validate."""
     tree = inheritance.copied(data)
-    tree.setdefault("name", name)
+    tree.setdefault("name", _default_name(source))
     tree.setdefault("material", {})  # so that the message names the first key missing in it
     check_tables(tree, source)
     told = read_old_words(tree, source)
@@ -103,7 +103,8 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str], name:
     inherited |= inheritance.inherit(tree, required)
     inheritance.size_rigid(tree)
     inheritance.take_from_owners(tree, inherited)
-    _fill_material(tree, source, changes)
+    known: dict[str, Any] = CATALOGUE.get(str(tree["material"].get("name")), {})
+    tree["material"] = known | tree["material"]
     _resolve_files(tree, source, changes)
     inheritance.drop_sizes(tree, sizes)
     inheritance.measure_bodies(tree, inherited)
@@ -134,17 +135,6 @@ def pose_scenarios(scene: Scene) -> tuple[Scene, ...]:
     return tuple(
         scene_from_dict(plain, scene.source, scenario.changes) for scenario in scene.scenarios
     )
-
-
-def _fill_material(tree: dict[str, Any], source: str, changes: list[Override]) -> None:
-    """Complete [material] by the catalogue where it names one."""
-    material = tree["material"]
-    if not isinstance(name := material.get("name"), str):
-        return
-    if name not in CATALOGUE:
-        where = blamed(source, changes, (("material", "name"),))
-        raise input_error(where, f"material = {shown(name)}: {unknown_material(name)}")
-    tree["material"] = CATALOGUE[name].values | material
 
 
 def _resolve_files(tree: dict[str, Any], source: str, changes: list[Override]) -> None:

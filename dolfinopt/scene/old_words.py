@@ -14,8 +14,7 @@ from typing import Any
 from dolfinopt.data import tables_of
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.base import input_error, rows
-from dolfinopt.scene.tables.joints import INBOARD, OUTBOARD, site_of
-from dolfinopt.scene.tables.machine import GROUND
+from dolfinopt.scene.tables.joints import GROUND, INBOARD, OUTBOARD, site_of
 
 Tree = dict[str, Any]
 Row = dict[str, Any]

@@ -17,7 +17,6 @@ from pydantic.json_schema import GenerateJsonSchema
 from dolfinopt import version
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
-from dolfinopt.scene.materials import CATALOGUE
 from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, table_in
 from dolfinopt.scene.tables.design import Design, Interpolation, Optimizer, Part
@@ -31,10 +30,8 @@ from dolfinopt.scene.tables.machine import (
     Force,
     Joint,
     Payload,
-    check_machine,
-    check_tree,
 )
-from dolfinopt.scene.tables.material import Material, material_keys
+from dolfinopt.scene.tables.material import CATALOGUE, Material, material_keys
 from dolfinopt.scene.tables.motion import LIMITS, Motion, Reduction, Simulation
 from dolfinopt.scene.tables.objective import Constraints, Limit, Objective, Scenario
 
@@ -225,13 +222,13 @@ class Scene(Table):
         return place_of(self, self.payload.arm or self.arms[-1].name) or (len(self.arms) - 1, 0)
 
     @property
-    def used_interfaces(self) -> frozenset[tuple[int, int]]:
+    def used_interfaces(self) -> set[tuple[int, int]]:
         """Return the interfaces, as of `end_effector`, of joints, forces and the payload."""
         sites = [force.arm for force in self.forces]
         sites += [joint.parent for joint in self.joints]
         sites += [end for closure in self.closures for end in closure.between]
-        places = {place_of(self, site) for site in sites}
-        return frozenset({self.end_effector, *(place for place in places if place is not None)})
+        places = (place_of(self, site) for site in sites)
+        return {self.end_effector, *(place for place in places if place is not None)}
 
     @property
     def dependent_joints(self) -> int:
@@ -304,7 +301,7 @@ class Scene(Table):
         arm, solid = self.arms[index], self.material
         own = {key: getattr(arm, key, None) for key in material_keys()}  # a law may be newer
         if arm.material is not None:
-            solid = Material(name=arm.material, **CATALOGUE[arm.material].values)
+            solid = Material(name=arm.material, **CATALOGUE[arm.material])
         elif own["kind"] not in (None, solid.kind):
             solid = Material.model_construct(**dict.fromkeys(own))
         given = {key: value for key, value in own.items() if value is not None}
@@ -350,18 +347,15 @@ class Scene(Table):
 
     def check_table(self) -> None:
         """Let every table check what it and others must agree on."""
-        # Closures first: which joints are driven depends on them; then forces, since an interface
-        # with a wrong name elsewhere seems to be of no use.
-        first = ("closures", "forces")
+        # Closures first: which joints are driven depends on them; then what sits on interfaces,
+        # since one with a wrong name elsewhere seems to be of no use.
+        first = ("closures", "forces", "joints", "payload")
         for key in (*first, *(key for key in type(self).model_fields if key not in first)):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):
                 if isinstance(table, Table):
                     table.check_at(self, (key, i) if tables is value else (key,))
-            if key == "joints" and self.is_spatial:
-                check_tree(self)
-                check_machine(self)
 
 
 # Keys that name a file, as (table, key); a scene holds their absolute paths.

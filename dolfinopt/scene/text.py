@@ -1,9 +1,11 @@
-"""Text files that users write."""
+"""Text files that users write, and TOML."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+from dolfinopt.data import tomllib
 from dolfinopt.disk import check_regular
 from dolfinopt.scene.tables.base import input_error
 
@@ -29,3 +31,14 @@ def read_text(source: str, remedy: str) -> str:
     except ValueError:  # a zero byte in the path
         reason = f"not a file name; {remedy}"
     raise input_error(source, reason)
+
+
+def read_toml(source: str, remedy: str = "give the path of a scene file (TOML)") -> dict[str, Any]:
+    """Return the data of the TOML file `source`; raise InputError if there is none."""
+    text = read_text(source, remedy)
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise input_error(source, "not a scene: arrays nested too deeply") from None
+    except ValueError as error:  # TOMLDecodeError, and numbers of too many digits
+        raise input_error(source, f"not valid TOML: {error}") from None

@@ -12,7 +12,8 @@ from dolfinopt.data import tomllib
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import scene_from_dict
 from dolfinopt.scene.old_words import read_old_words
-from dolfinopt.scene.toml import read_toml, toml_value
+from dolfinopt.scene.tables.base import toml_value
+from dolfinopt.scene.text import read_toml
 
 HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z0-9_.-]+)\s*\]{1,2}\s*(#.*)?$")
 KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")

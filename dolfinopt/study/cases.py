@@ -123,6 +123,7 @@ class Outcome:
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
+    summary: Mapping[str, Any] = field(default_factory=dict)  # content of summary.json
     samples: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n,) of `SAMPLED`
     messages: Mapping[int, str] = field(default_factory=dict)  # of samples that failed, by number
 
@@ -150,11 +151,6 @@ class Outcome:
         return [f"{case.label}, sample {names[k]}: {text}" for k, text in self.messages.items()]
 
     @property
-    def stopped(self) -> str:
-        """Why an optimisation stopped."""
-        return self.stop_reason if self.case.action == "optimize" else ""
-
-    @property
     def design(self) -> Path:
         """Path of the design.npz."""
         return self.folder / "design.npz"
@@ -164,12 +160,6 @@ class Outcome:
         brief, complete = self.folder / DEVIATION, self.folder / TRAJECTORY
         with np.load(brief if brief.exists() else complete, allow_pickle=False) as data:
             return data["t"], lengths(data["deviation"])
-
-    def summary(self) -> dict[str, Any]:
-        """Return the content of summary.json, {} of a case that failed."""
-        if self.failure:
-            return {}
-        return dict(json.loads((self.folder / SUMMARY).read_text("utf-8")))
 
     def history(self) -> list[HistoryRow]:
         """Return the optimisation's history."""
@@ -362,19 +352,20 @@ class _Place:
 
     def read(self, case: Case) -> Outcome:
         """Read a case back."""
-        failed = self._failure(case).exists()
-        path = self._failure(case) if failed else self[case] / SUMMARY
+        failed = self._failure(case)
+        path = failed if failed.exists() else self[case] / SUMMARY
         data = json.loads(path.read_text("utf-8"))
-        result: dict[str, Any] = {"failure": data["message"] if failed else ""}
-        if case.action == "sample":
-            samples = data.get("samples", {})
-            result["samples"] = {name: np.array(values, float) for name, values in samples.items()}
-            result["messages"] = {int(k): text for k, text in data.get("messages", {}).items()}
-        elif not failed:
-            result |= {name: data[name] for name in FIGURES if name in data}
-        if not failed:
-            result["seconds"] = data["seconds"]["total"]
-        return Outcome(case, self[case], **result)
+        samples, messages = data.get("samples", {}), data.get("messages", {})
+        return Outcome(
+            case,
+            self[case],
+            data.get("message", ""),
+            **{name: data[name] for name in FIGURES if name in data},
+            seconds=data.get("seconds", {}).get("total", math.nan),
+            summary={} if path == failed else data,
+            samples={name: np.array(values, float) for name, values in samples.items()},
+            messages={int(k): text for k, text in messages.items()},
+        )
 
     def check(self) -> None:
         """Tell of cases that have ended; raise OthersFailed if another rank has failed."""

@@ -278,7 +278,7 @@ def _limits(outcome: Outcome) -> list[Limit]:
     """Return the scene's limits and what becomes of them, without that of the volume."""
     return [
         Limit(name, "", item["value"], item["limit"], item["unit"], item["bound"] == "least")
-        for name, item in outcome.summary().get("constraints", {}).items()
+        for name, item in outcome.summary.get("constraints", {}).items()
         if not name.startswith("volume_fraction")
     ]
 
@@ -320,7 +320,7 @@ def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps
 
 def _as_heavy(every: Sequence[Members], outcome: Outcome) -> list[tuple[Members, Shares]]:
     """Return the members that have the masses of what was simulated in every arm."""
-    masses = outcome.summary()["mass"]
+    masses = outcome.summary["mass"]
     return [
         (members, shares) for members in every if (shares := members.of_mass(masses)) is not None
     ]
@@ -363,7 +363,7 @@ def _reached(scene: Scene, members: Members, outcome: Outcome) -> str:
         most = max(limits, key=lambda limit: limit.excess)
         used = f"{most.words} {most.value:.3g} of {most.limit:.3g}"
         value = f"{value}, {with_unit(used, most.unit)}"
-    mass = outcome.summary()["designed_mass"]
+    mass = outcome.summary["designed_mass"]
     return f"a straight {members.kind} of the links' mass at the start, {mass:.3g} kg: {value}"
 
 

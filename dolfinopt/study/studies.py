@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -24,7 +24,7 @@ from dolfinopt.output.design import arms_with_design
 from dolfinopt.plots.panels import Line, Panel
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
-from dolfinopt.study.cases import Case, Outcome, Runner, Steps
+from dolfinopt.study.cases import Case, Outcome, Steps
 from dolfinopt.study.tables import (
     DesignFigure,
     Figure,
@@ -80,7 +80,7 @@ def study(
     reoptimize: bool = False,
     kinds: Sequence[str] = (),
 ) -> Steps[Study]:
-    """Return the steps of a study, see `carry_out`.
+    """Return the steps of a study, see `Runner.follow`.
 
     Args:
         scene, preset: what is varied; which study, None for a sweep over `vary` alone.
@@ -119,38 +119,30 @@ def study(
     return (yield from coordinates_steps(scene, designs, counts))
 
 
-def carry_out(steps: Steps[Study], runner: Runner) -> Study:
-    """Do what a study asks for (collective); the result is the same on all ranks."""
-    return replace(runner.follow(steps), computed=runner.computed)
-
-
 def reported(name: str, rows: Rows, report: Callable[[pd.DataFrame], Report]) -> Steps[Study]:
     """Return the steps of a study that asks for all its cases at once.
 
     Args:
         name: of its files.
         rows: labels by column, and the case of each.
-        report: tables and figures of the frame of all rows, see `tabulated`.
+        report: tables and figures of the frame of all rows: labels, and `results_of` the case.
     """
     cases = [case for _, case in rows]
     for case in cases:
         if case.action == "optimize":
             case.scene.check_designed()
     outcomes = yield cases
-    frame = tabulated((labels, outcomes[case]) for labels, case in rows)
-    tables, figures = report(frame)
+    tables, figures = report(
+        pd.DataFrame({**labels, **results_of(outcomes[case])} for labels, case in rows)
+    )
     failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)
     return Study(name, tuple(tables), tuple(figures), failures)
 
 
-def tabulated(rows: Iterable[tuple[Mapping[str, Any], Outcome]]) -> pd.DataFrame:
-    """Return a row a case: its labels, the results with units, and the outcome itself."""
-    return pd.DataFrame({**labels, **results_of(outcome)} for labels, outcome in rows)
-
-
 def results_of(outcome: Outcome) -> dict[str, Any]:
     """Return results by column, with units, and the outcome itself."""
-    summary = outcome.summary()
+    summary = outcome.summary
+    ended = outcome.stop_reason if outcome.case.action == "optimize" else ""
     return {
         "label": outcome.case.label,
         COMPLIANCE: outcome.compliance,
@@ -162,7 +154,7 @@ def results_of(outcome: Outcome) -> dict[str, Any]:
         "grayness [-]": outcome.grayness,
         "iterations": outcome.iterations,
         "seconds": outcome.seconds,
-        "ended by": f"failed: {outcome.failure}" if outcome.failure else outcome.stopped,
+        "ended by": f"failed: {outcome.failure}" if outcome.failure else ended,
         "failure": outcome.failure,
         "outcome": outcome,
     }
@@ -454,7 +446,7 @@ def objective_steps(scene: Scene, kinds: Sequence[str] = ()) -> Steps[Study]:
 
 def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
     """Return true values in the motion, efforts by one set of weights, and all designs."""
-    result = [outcome.summary() for outcome in frame["outcome"]]
+    result = [outcome.summary for outcome in frame["outcome"]]
     none = {"": math.nan}
     forces = [np.array([*item.get("drive_rms", none).values()]) for item in result]
     by = 1.0 if weights is None else np.array(weights)

@@ -110,7 +110,6 @@ class Study:
     tables: tuple[Table, ...]  # the main one first
     figures: tuple[Figure, ...]
     failures: tuple[str, ...] = ()  # one line each
-    computed: int = 0  # cases that were not there before
 
     def markdown(self) -> str:
         """Return all tables but the long ones."""

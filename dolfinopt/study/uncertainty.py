@@ -167,9 +167,7 @@ def unit_points(count: int, dimensions: int, seed: int) -> np.ndarray:
 
 def draw(distributions: Sequence[Distribution], points: np.ndarray) -> np.ndarray:
     """Return the samples (n, d) at points (n, d) of the unit cube."""
-    return np.stack(
-        [distribution.at(points[:, i]) for i, distribution in enumerate(distributions)], axis=1
-    )
+    return np.column_stack([law.at(shares) for law, shares in zip(distributions, points.T)])
 
 
 # -- statistics ------------------------------------------------------------------------------

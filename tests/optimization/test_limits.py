@@ -15,7 +15,6 @@ from dolfinopt.optimization.iterate import Iterate, leaps
 from dolfinopt.optimization.measured import ERODED_LIMIT_FACTOR
 from dolfinopt.optimization.problem import limits_at, problem_of
 from dolfinopt.optimization.stopping import StopCode
-from dolfinopt.plots.curves import limits_by_column
 from dolfinopt.responses.constraints import EXCESS, Limit, tightest
 from dolfinopt.responses.response import constraints_of
 
@@ -184,12 +183,8 @@ def test_an_objective_turned_round_rises():
 
 
 @pytest.mark.serial  # ranks have no part in it
-def test_limits_by_the_columns_of_the_history():
+def test_constraints_in_their_order():
     built = scene("constraints.first_frequency=[0.5,1.0]", "constraints.mass=2.0", iterations=1)
-    names = ["volume_fraction_arm1", "volume_fraction_arm2", "mass"]
-    names += ["first_frequency_arm1", "first_frequency_arm2"]
-    found = limits_by_column(built, dict.fromkeys(names, 3.0))
-    assert [found[name].limit for name in names] == [1.0, 1.0, 2.0, 0.5, 1.0]
     asked = [one.name for one in constraints_of(built)]
     assert asked == ["volume_fraction", "mass", "first_frequency"]
     assert tightest(()) == ""

@@ -127,11 +127,18 @@ def test_design_shows_each_density_in_its_place():
     assert scale.get_xlim() == (0.0, 1.0) and "density" in scale.get_xlabel()
 
 
+def optimised(rows, label, unit, limits=()):
+    """Return what the picture of a history asks of a result."""
+    response = SimpleNamespace(label=label, unit=unit)
+    scene = SimpleNamespace(objective=SimpleNamespace(response=response))
+    return SimpleNamespace(rows=rows, scene=scene, limits=limits)
+
+
 @pytest.mark.parametrize("count", [1, 400])
 def test_history_shows_the_rows(count):
     rows = [HistoryRow(k, 28.0 * 0.9**k, 0.055 * 0.95**k, 1.0 / (k + 1), 0.5, 0.2, 0.1 * k)
             for k in range(count)]  # fmt: skip
-    figure = curves.history_figure(rows, "compliance of the load cases [N m]", {})
+    figure = curves.history_figure(optimised(rows, "compliance of the load cases", "N m"))
     panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
     columns = {
         "compliance of the load cases [N m]": [r.objective for r in rows],
@@ -154,14 +161,14 @@ def test_history_shows_the_rows(count):
 def test_history_has_a_panel_for_every_column_there_is():
     """Constraints by name, a residual: as the rows have them; limits in mm and MPa."""
     some = 2.0, 0.01, 0.5, 0.5, 0.1, 1.0
-    limits = {
-        "first_frequency_arm1": Limit("first_frequency", "arm1", 60.0, 80.0, "Hz", True),
-        "deviation": Limit("deviation", "", 0.02, 0.008, "m"),
-        "stress": Limit("stress", "", 90e6, 60e6, "Pa"),
-    }
-    values = {name: limit.value for name, limit in limits.items()}
+    limits = [
+        Limit("first_frequency", "arm1", 60.0, 80.0, "Hz", True),
+        Limit("deviation", "", 0.02, 0.008, "m"),
+        Limit("stress", "", 90e6, 60e6, "Pa"),
+    ]
+    values = {limit.name: limit.value for limit in limits}
     rows = [HistoryRow(k, *some, 10.0**-k, constraints=values) for k in range(3)]
-    figure = curves.history_figure(rows, "objective [N m]", limits)
+    figure = curves.history_figure(optimised(rows, "objective", "N m", limits))
     panels = {axes.get_title(loc="left"): axes for axes in figure.axes}
     residual = panels["Karush-Kuhn-Tucker residual [-]"].lines[0].get_ydata()
     np.testing.assert_allclose(residual, [1.0, 0.1, 0.01])
@@ -177,8 +184,17 @@ def test_history_has_a_panel_for_every_column_there_is():
 
 def test_deviation_shows_millimetres_and_names_the_largest():
     t = np.linspace(0.0, 3.0, 301)
-    optimised = 0.007 * np.sin(t)[:, None] * [0.6, 0.8]
-    figure = curves.deviation_figure(t, optimised, 8.0 * optimised, limits=((0.01, 1.9, 3.0),))
+    limits = SimpleNamespace(limit={"deviation": 0.01}.get)
+    scene = SimpleNamespace(constraints=limits, lead=1.9, horizon=3.0)
+
+    def figure_of(deviation, factor):
+        distance = np.linalg.norm(deviation, axis=1)
+        moving = SimpleNamespace(
+            t=t, distance=distance, scene=scene, closure=None, is_machine=False
+        )
+        return curves.deviation_figure(moving, factor * deviation)
+
+    figure = figure_of(0.007 * np.sin(t)[:, None] * [0.6, 0.8], 8.0)
     (axes,) = figure.axes
     notes = axes.get_legend().texts
     for line, note, largest in zip(axes.lines, notes, (56.0, 7.0), strict=True):
@@ -190,7 +206,7 @@ def test_deviation_shows_millimetres_and_names_the_largest():
     assert "[s]" in axes.get_xlabel() and "[mm]" in axes.get_ylabel()
     for size in (1e-7, 0.3, 50.0):  # m
         deviation = size * np.stack([np.sin(7.0 * t), np.cos(7.0 * t) - 1.0], axis=1)
-        shown(curves.deviation_figure(t, deviation, 1.3 * deviation))
+        shown(figure_of(deviation, 1.3))
 
 
 def test_motion_shows_the_payload_where_it_is(tmp_path):

@@ -11,7 +11,7 @@ from runs import demo, refused, scene
 import dolfinopt as do
 from dolfinopt import Model
 from dolfinopt.motion.build import rests
-from dolfinopt.plots.curves import deviation_limits, limits_by_column
+from dolfinopt.plots.curves import deviation_limits
 from dolfinopt.responses.constraints import limits_of
 from dolfinopt.responses.response import find
 from dolfinopt.scene.laws import Limits, law_for
@@ -94,7 +94,6 @@ def test_a_drive_may_have_no_limit():
     (found,) = limits_of(made, result.evaluation)[-1:]
     assert (found.name, found.limit) == ("peak_force_arm1", 30.0)
     assert len(result.evaluation.constraints) == 3  # with the volumes of both arms
-    assert limits_by_column(made, {found.name: found.value}) == {found.name: found}
     text = json.dumps(made.to_dict(), allow_nan=False)
     assert do.scene_from_dict(json.loads(text)) == made
 

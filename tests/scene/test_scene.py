@@ -217,7 +217,7 @@ SHOWN = [
     ("arms.0.name", "ARM2", 'arms.1.name = "arm2"', "no other arm has"),
     ("arms.0.name", "arm2_face", 'arms.1.name = "arm2"', "both parts would have one name"),
     ("motion.path", "joints", "motion.file = None (default)", "table (CSV)"),
-    ("material.name", "stone", 'material = "stone"', "dolfinopt keys material"),
+    ("material.name", "stone", 'material.name = "stone"', "dolfinopt keys material"),
     ("design.volume_fraction", 5e-4, "design.minimum = 0.001 (default)", "at most volume_fraction"),
     ("design.initial", 1e-3, "design.minimum = 0.001 (default)", "less than initial = 0.001"),
 ]

@@ -10,7 +10,6 @@ from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.scene.csv_table import read_table
 from dolfinopt.study.cases import Runner
 from dolfinopt.study.motions import RIGID, SHAPERS, study_motions
-from dolfinopt.study.studies import carry_out
 
 QUICK = ("arms.cells=[20,3]", "design.filter_radius=0", "simulation.tolerance=1e-3",
          "optimizer.max_iterations=1", "motion.horizon=2.3")  # fmt: skip
@@ -22,7 +21,7 @@ def found(tmp_path_factory):
     folder = tmp_path_factory.mktemp("motions")
     scene = do.load_scene(ROOT / "demos" / "two_arm.toml", QUICK)
     runner = Runner(folder, MPI.COMM_SELF, False)
-    return carry_out(study_motions(scene, (), folder), runner), folder, scene
+    return runner.follow(study_motions(scene, (), folder)), folder, scene
 
 
 @pytest.mark.serial

@@ -44,6 +44,7 @@ class Found:
     failure: str = ""
     least: set = field(default_factory=set)
 
+    @property
     def summary(self):
         limits = {}
         for name, value in self.values.items():

@@ -30,7 +30,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.spatial.transform import Rotation
 
 from dolfinopt.errors import InputError
-from dolfinopt.scene.toml import read_toml
+from dolfinopt.scene.text import read_toml
 
 if TYPE_CHECKING:
     from trimesh import Trimesh

@@ -34,7 +34,7 @@ from dolfinopt.exchange.urdf.robot import (
 )
 from dolfinopt.motion.paths import curve_in_time
 from dolfinopt.scene.csv_table import Table, column_names, read_table
-from dolfinopt.scene.toml import toml_value
+from dolfinopt.scene.tables.base import toml_value
 
 TRAJECTORY = "trajectory.csv"  # beside the scene
 RECORD = "robot.json"  # beside the scene: where its solids come from

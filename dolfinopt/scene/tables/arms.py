@@ -29,6 +29,7 @@ from dolfinopt.scene.tables.base import (
 from dolfinopt.scene.tables.design import Region
 from dolfinopt.scene.tables.joints import (
     DRIVE_KEYS,
+    GROUND,
     Drive,
     Interface,
     Point,
@@ -448,11 +449,9 @@ class Arm(Drive):
             return math.prod(self.cells)
         if (size := self.cell_size) is None:
             return 0
-        if self.is_solid:
-            cubes = self.length * self.height * self.thickness / size**3
-            return round(6.0 * cubes if self.cell_shape == "tetrahedron" else cubes)
-        squares = self.length * self.height / size**2
-        return round(2.0 * squares if self.cell_shape == "triangle" else squares)
+        sizes = (self.length, self.height, self.thickness)[: 3 if self.is_solid else 2]
+        simplices = {"tetrahedron": 6.0, "triangle": 2.0}.get(self.shape, 1.0)
+        return round(simplices * math.prod(sizes) / size ** len(sizes))
 
     @property
     def nodes_per_cell(self) -> float:
@@ -544,8 +543,10 @@ class Arm(Drive):
         """Refuse files of one name, and what does not fit the arm whose design it has."""
         index = scene.places[self.name]
         before = scene.arms[:index]
-        if not scene.is_spatial:
-            self._check_in_plane(before)
+        if scene.is_spatial:
+            self._check_in_space(scene)
+        else:
+            self._check_in_plane(scene, index)
         if self.flexible:
             self._check_material(scene, index)
         if problem := tensor_problem(self.inertia):
@@ -574,9 +575,27 @@ class Arm(Drive):
             )
             raise Refusal(refusal.reason, *keys) from None
 
-    def _check_in_plane(self, before: tuple[Arm, ...]) -> None:
+    def _check_in_space(self, scene: Scene) -> None:
+        """Refuse an arm that no joint holds, or with cells of the plane."""
+        if self.name == GROUND:
+            raise Refusal(
+                'expected another name: with [[joints]] "ground" is what the machine stands on',
+                ".name",
+            )
+        if self.name not in [joint.child for joint in scene.joints]:
+            raise Refusal("expected one of [[joints]] whose child it is", ".name", "joints")
+        if self.flexible and not self.is_solid:
+            raise Refusal(
+                "expected three integers (along, over the height, over the thickness) with "
+                "[[joints]]: an arm that moves in space is a solid, or rigid = true",
+                ".cells",
+                "joints",
+            )
+
+    def _check_in_plane(self, scene: Scene, index: int) -> None:
         """Refuse what moves in space alone, and names with which files of parts would be one."""
         self.check_plane_bearing()
+        self._check_springs(scene, index)
         if self.length == 0.0:
             reason = "expected more than 0 without [[joints]]: the machine moves in the plane"
             raise Refusal(reason, ".length")
@@ -587,7 +606,7 @@ class Arm(Drive):
                 ".cells" if self.cells is not None else ".cell_shape",
             )
         own = self.name.casefold()  # as a_face.step
-        for other in (arm.name.casefold() for arm in before):
+        for other in (arm.name.casefold() for arm in scene.arms[:index]):
             for longer, shorter in ((own, other), (other, own)):
                 if longer.removeprefix(shorter) in PART_FILES:
                     raise Refusal(
@@ -595,6 +614,27 @@ class Arm(Drive):
                         "behind it: files of both parts would have one name",
                         ".name",
                     )
+
+    def _check_springs(self, scene: Scene, index: int) -> None:
+        """Refuse springs at joints of a loop in the plane: between drive and arm without a drive.
+
+        And those of a bearing.
+        """
+        follows = index >= len(scene.arms) - scene.dependent_joints
+        if follows and self.gear_stiffness > 0.0:
+            raise Refusal(
+                f"expected 0: the joint of {self.name} follows from the others in the closed "
+                "loop and has no drive",
+                ".gear_stiffness",
+                "closures.0.kind",
+            )
+        if scene.closures and self.bearing_stiffness is not None:
+            raise Refusal(
+                "expected none with [[closures]] without [[joints]]: state [[joints]] about "
+                "the plane's normal, or leave it out",
+                ".bearing_stiffness",
+                "closures.0.kind",
+            )
 
     def _check_design(self, before: tuple[Arm, ...]) -> None:
         """Refuse a design of no arm before it, or whose cells are not this arm's one by one."""

@@ -27,6 +27,11 @@ WIDEST = 0.45
 MEMBER_CELLS = 3  # in the width of the thinnest member: with fewer one cell more or less decides
 
 
+def _width(erosion: float) -> float:
+    """Return the width of a member that the erosion leaves, over 2 r, see `Design.radius`."""
+    return math.acosh(1.0 / (1.0 - 2.0 * erosion))
+
+
 class Design(Table):
     """Design variables x of all cells, their limits and their filter."""
 
@@ -73,7 +78,7 @@ class Design(Table):
         if member == gap:
             return self.erosion, self.erosion
         thin, wide = min(member, gap), max(member, gap)
-        wider = 0.5 - 0.5 / math.cosh(wide / thin * math.acosh(1.0 / (1.0 - 2.0 * self.erosion)))
+        wider = 0.5 - 0.5 / math.cosh(wide / thin * _width(self.erosion))
         return (self.erosion, wider) if member < gap else (wider, self.erosion)
 
     @property
@@ -97,7 +102,7 @@ class Design(Table):
         if not self.controls_widths:
             return self.filter_radius
         thin = min(self.least_widths)
-        return thin * math.sqrt(3.0) / math.acosh(1.0 / (1.0 - 2.0 * self.erosion))
+        return thin * math.sqrt(3.0) / _width(self.erosion)
 
     @property
     def stated_widths(self) -> dict[str, float]:
@@ -122,9 +127,7 @@ class Design(Table):
             return
         key = next(iter(stated))
         # The width that `WIDEST` gives, in widths of `erosion`.
-        ratio = math.acosh(1.0 / (1.0 - 2.0 * WIDEST)) / math.acosh(
-            1.0 / (1.0 - 2.0 * self.erosion)
-        )
+        ratio = _width(WIDEST) / _width(self.erosion)
         thin, wide = min(self.least_widths), max(self.least_widths)
         if wide > max(ratio, 1.0) * thin * (1.0 + 1e-9):
             other, wider = sorted(("minimum_gap", "minimum_member"), key=vars(self).__getitem__)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dolfinopt.scene.tables.arms import Arm
     from dolfinopt.scene.tables.machine import Joint
 
-INBOARD, OUTBOARD = "inboard", "outboard"
+INBOARD, OUTBOARD, GROUND = "inboard", "outboard", "ground"
 Point = Three[Position]
 Components = TypeVar("Components", bound=tuple[float, ...])
 
@@ -75,21 +75,21 @@ def interface_number(arm: Arm, name: str) -> int | None:
 def place_of(scene: Scene, text: str) -> tuple[int, int] | None:
     """Return arm and interface number of "arm.interface"; None for the ground."""
     name, interface = site_of(text)
-    k = next((k for k, arm in enumerate(scene.arms) if arm.name == name), None)
+    k = scene.places.get(name)
     return None if k is None else (k, interface_number(scene.arms[k], interface) or 0)
 
 
 def check_site(scene: Scene, text: str, at: str, also: tuple[str, ...] = ()) -> None:
     """Refuse what is no interface of an arm, nor one of the words `also`, such as "ground"."""
     name, interface = site_of(text)
-    arms = {arm.name: arm for arm in scene.arms}
     if text in also:
         return
-    if name not in arms:
-        allowed = " | ".join(map(shown, (*also, *arms)))
+    if name not in scene.places:
+        allowed = " | ".join(map(shown, (*also, *scene.places)))
         raise Refusal(f'expected the name of an arm, or "arm.interface": {allowed}', at)
-    if interface_number(arms[name], interface) is None:
-        known = (OUTBOARD, *(item.name for item in arms[name].further_interfaces))
+    arm = scene.arms[scene.places[name]]
+    if interface_number(arm, interface) is None:
+        known = (OUTBOARD, *(item.name for item in arm.further_interfaces))
         allowed = " | ".join(shown(f"{name}.{item}") for item in known)
         raise Refusal(f"expected an interface of {name}: {allowed}", at)
 
@@ -114,25 +114,16 @@ def check_interfaces(scene: Scene, index: int) -> None:
                 f'have faces, or a node, of the name "{interface.name}"',
                 f"{here}.radius",
             )
-
-
-def check_used(scene: Scene) -> None:
-    """Refuse interfaces on which nothing sits; those of arms of one design are the same."""
-    for index, arm in enumerate(scene.arms):
-        if arm.shares:
-            continue
-        sharing = [
-            index,
-            *(k for k, item in enumerate(scene.arms) if item.shares and item.design == arm.name),
-        ]
-        for number, interface in enumerate(arm.further_interfaces, start=1):
-            if not scene.used_interfaces & {(k, number) for k in sharing}:
-                raise Refusal(
-                    f'expected a joint with parent = "{arm.name}.{interface.name}", one of '
-                    "[[closures]], the payload or one of [[forces]] there: nothing sits on it",
-                    f"arms.{index}.interfaces.{arm.interfaces.index(interface)}.name",
-                    "joints",
-                )
+    # Arms of one design have the same ones.
+    sharing = [k for k, item in enumerate(scene.arms) if item.shares and item.design == arm.name]
+    for number, interface in enumerate(() if arm.shares else arm.further_interfaces, start=1):
+        if not scene.used_interfaces & {(k, number) for k in (index, *sharing)}:
+            raise Refusal(
+                f'expected a joint with parent = "{arm.name}.{interface.name}", one of '
+                "[[closures]], the payload or one of [[forces]] there: nothing sits on it",
+                f".interfaces.{arm.interfaces.index(interface)}.name",
+                "joints",
+            )
 
 
 # -- interfaces by their bores, and the arm's frame in the mesh file that they give ---------------

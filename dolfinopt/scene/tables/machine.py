@@ -27,24 +27,22 @@ from dolfinopt.scene.tables.base import (
     shown,
 )
 from dolfinopt.scene.tables.joints import (
+    GROUND,
     Components,
     Drive,
     check_direction,
     check_site,
-    check_used,
     joint_drives,
     place_of,
     site_of,
 )
-from dolfinopt.scene.tables.responses import asked, need_of
+from dolfinopt.scene.tables.responses import need_of
 
 if TYPE_CHECKING:
     from dolfinopt.scene.schema import Scene
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 Direction = Annotated[Three[Component], AfterValidator(check_direction)]
-GROUND = "ground"
-PATHS = ("joints", "points", "line")  # of machines in space
 
 
 def check_joint_name(name: str) -> str:
@@ -88,83 +86,37 @@ class Joint(Drive):
             self.need("axis", "type")
 
     def check_in_scene(self, scene: Scene) -> None:
-        """Refuse names that are unknown."""
-        names = [arm.name for arm in scene.arms]
-        if self.child not in names:
-            allowed = " | ".join(map(shown, names))
+        """Refuse what is no joint of a tree that stands on the ground and moves."""
+        if self.child not in scene.places:
+            allowed = " | ".join(map(shown, scene.places))
             raise Refusal(f"expected the name of an arm: {allowed}", ".child")
         check_site(scene, self.parent, ".parent", (GROUND,))
-
-
-def check_tree(scene: Scene) -> None:
-    """Refuse arms not held by one joint, joints off the ground or that nothing moves."""
-    holding: dict[str, Joint] = {}
-    for i, joint in enumerate(scene.joints):
-        if (other := holding.setdefault(joint.child, joint)) is not joint:
+        holding = {joint.child: joint for joint in reversed(scene.joints)}
+        if (other := holding[self.child]) is not self:
             raise Refusal(
-                f"expected an arm that no other joint holds: {joint.child} hangs on "
+                f"expected an arm that no other joint holds: {self.child} hangs on "
                 f"{other.name}; a joint that closes a loop is one of [[closures]]",
-                f"joints.{i}.child",
+                ".child",
             )
-    for k, arm in enumerate(scene.arms):
-        if arm.name == GROUND:
-            raise Refusal(
-                'expected another name: with [[joints]] "ground" is what the machine stands on',
-                f"arms.{k}.name",
-            )
-        if arm.name not in holding:
-            raise Refusal(
-                "expected one of [[joints]] whose child it is", f"arms.{k}.name", "joints"
-            )
-    for i, joint in enumerate(scene.joints):
         if not scene.closures:
-            reason = "without [[closures]]: no loop moves the joint"
-            joint.refuse_stated(f"joints.{i}.passive", reason)
-        passed, above = [joint.child], joint.parent_arm
-        while above != GROUND and above not in passed:
+            self.refuse_stated(".passive", "without [[closures]]: no loop moves the joint")
+        passed, above = [self.child], self.parent_arm
+        while above in holding and above not in passed:
             passed.append(above)
             above = holding[above].parent_arm
-        if above != GROUND:
+        if above in passed:
             raise Refusal(
-                f"expected a tree that stands on the ground: from {joint.child} its parents lead "
+                f"expected a tree that stands on the ground: from {self.child} its parents lead "
                 f"to {above} again",
-                f"joints.{i}.parent",
+                ".parent",
             )
-    if not any(joint.moves for joint in scene.joints):
-        raise Refusal('expected a "revolute" or "prismatic" joint: nothing moves', "joints.0.type")
-
-
-def check_machine(scene: Scene) -> None:
-    """Refuse what only a machine in the plane has, or what has no equations in space yet."""
-    motion = scene.motion
-    if motion.path not in PATHS:
-        allowed = " | ".join(map(shown, PATHS))
-        raise Refusal(f"expected {allowed} with [[joints]]", "motion.path", "joints")
-    for key in ("start", "end"):
-        if motion.path == "line" and len(getattr(motion, key)) == 2:
-            raise Refusal(
-                "expected an array of three numbers with [[joints]]", f"motion.{key}", "joints"
-            )
-    key = "motion.initial_joints"
-    if motion.path == "joints" and not scene.closures:
-        reason = 'with motion.path = "joints", which does not use it without [[closures]]'
-        motion.refuse_stated(key, reason, "motion.path")
-    refuse_count(motion.initial_joints, [joint.name for joint in scene.movable], key)
-    for k, arm in enumerate(scene.arms):
-        if arm.flexible and not arm.is_solid:
-            raise Refusal(
-                "expected three integers (along, over the height, over the thickness) with "
-                "[[joints]]: an arm that moves in space is a solid, or rigid = true",
-                f"arms.{k}.cells",
-                "joints",
-            )
+        if not scene.movable:
+            raise Refusal('expected a "revolute" or "prismatic" joint: nothing moves', ".type")
 
 
 # -- `[[closures]]`: joints that close loops between arms, or with the ground ---------------------
 
 Line = tuple[Component, Component]
-# Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
-OF_THE_END = ("deviation", "settling")
 # What is positive of every equation's force and moment, in the joint's frame; in the plane and in
 # space.
 Names = tuple[str, ...]
@@ -296,43 +248,6 @@ class Closures(Table):
                 "motion.path",
                 ".kind",
             )
-        self._check_springs(scene)
-        if self.kind == "pin":
-            self._check_pin(scene)
-
-    def _check_springs(self, scene: Scene) -> None:
-        """Refuse springs between drive and arm at joints of the plane that have no drive."""
-        first = len(scene.arms) - scene.dependent_joints
-        for index, arm in enumerate(scene.arms):
-            if index >= first and arm.gear_stiffness > 0.0:
-                raise Refusal(
-                    f"expected 0: the joint of {arm.name} follows from the others in the closed "
-                    "loop and has no drive",
-                    f"arms.{index}.gear_stiffness",
-                    ".kind",
-                )
-            if arm.bearing_stiffness is not None:
-                raise Refusal(
-                    "expected none with [[closures]] without [[joints]]: state [[joints]] about "
-                    "the plane's normal, or leave it out",
-                    f"arms.{index}.bearing_stiffness",
-                    ".kind",
-                )
-
-    def _check_pin(self, scene: Scene) -> None:
-        """Refuse responses of the deviation of an end that a pin holds, and forces along a line."""
-        for n, force in enumerate(scene.forces):
-            if force.name == "closure":
-                reason = "expected 0.0, the default, with a pin: its end does not move"
-                raise Refusal(reason, f"forces.{n}.factor", ".kind")
-        for key in set(OF_THE_END).intersection(response.name for response in asked(scene)):
-            place = "objective.kind" if scene.objective.kind == key else f"constraints.{key}"
-            raise Refusal(
-                "expected another response with a pin: the end of the last arm is held, it "
-                "deviates from nothing; take the compliance",
-                place,
-                ".kind",
-            )
 
 
 # -- `[control]` ---------------------------------------------------------------------------------
@@ -436,8 +351,6 @@ class Payload(Table):
             raise Refusal(problem, ".inertia")
         if self.arm is not None:
             check_site(scene, self.arm, ".arm")
-        if scene.is_spatial:
-            check_used(scene)
 
 
 # -- given forces ----------------------------------------------------------------------------
@@ -478,6 +391,12 @@ class Force(Table):
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse what acts nowhere, or a key that nothing uses."""
         check_site(scene, self.arm, ".arm")
+        if self.name == "closure" and scene.is_pinned:
+            raise Refusal(
+                "expected 0.0, the default, with a pin: its end does not move",
+                ".factor",
+                "closures.0.kind",
+            )
         if scene.is_spatial and isinstance(self.moment, float):
             raise Refusal("expected an array of three numbers with [[joints]]", ".moment")
         if scene.control is None or scene.control.feed_forward == "none":

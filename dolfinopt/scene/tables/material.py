@@ -1,16 +1,18 @@
-"""`[material]`, and what a scene knows of every kind of material law.
+"""`[material]`, its catalogue, and what a scene knows of every kind of material law.
 
 What a law computes stands in `dolfinopt.fem.laws`; see docs/pages/develop/own-form.md.
 """
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, WithJsonSchema
 
-from dolfinopt.scene.materials import CATALOGUE, unknown_material
+from dolfinopt.data import tables_of
 from dolfinopt.scene.tables.base import (
     Refusal,
     Table,
@@ -26,11 +28,25 @@ FibreAngle = Annotated[float, Field(ge=-6.3, le=6.3)]  # rad
 Quantity = Annotated[float, Field(ge=-1e15, le=1e15)]  # a key of a law of one's own
 
 
+# Of materials by name: keys of [material] and their values; standards and data sheets.
+CATALOGUE: Mapping[str, dict[str, Any]] = tables_of("scene/materials.toml")
+SOURCES = {name: str(values.pop("source")) for name, values in CATALOGUE.items()}
+
+
 def check_material(name: str) -> str:
-    """Return `name` if the catalogue has it."""
-    if name not in CATALOGUE:
-        raise Refusal(unknown_material(name))
-    return name
+    """Return `name` if the catalogue has it; else tell the nearest ones, or where all stand."""
+    if name in CATALOGUE:
+        return name
+    lower = {known.casefold(): known for known in CATALOGUE}
+    wanted = name.casefold()
+    parts = [known for key, known in lower.items() if wanted and wanted in key]
+    near = parts or [lower[key] for key in difflib.get_close_matches(wanted, lower, 2, 0.5)]
+    quoted = " or ".join(f'"{item}"' for item in near[:4])
+    hint = f"did you mean {quoted}? " if near else ""
+    raise Refusal(
+        f"expected a material of the catalogue; {hint}"
+        "dolfinopt keys material lists all of them; or give its values in a table [material]"
+    )
 
 
 CatalogueName = Annotated[

@@ -35,6 +35,7 @@ MOST_COEFFICIENTS = 8
 Coefficient = Annotated[float, Field(ge=-SHAPE_LIMIT, le=SHAPE_LIMIT)]
 PathLimit = Annotated[float, Field(ge=1e-6, le=1e12)]  # m/s, m/s2, m/s3; in mm, too
 LIMITS = ("max_speed", "max_acceleration", "max_jerk")
+PATHS = ("joints", "points", "line")  # of machines in space
 PROFILES = ("trapezoidal", "s-curve")  # laws that are shaped by the limits
 
 
@@ -154,7 +155,7 @@ class Motion(Table):
             )
 
     def check_in_scene(self, scene: Scene) -> None:
-        """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
+        """Refuse ends, laws and joints that the machine cannot have."""
         if self.table_ends == "moving" and self.horizon > self.duration:
             raise Refusal(
                 f"expected motion.duration = {self.duration:g} [s], the end of the table, with "
@@ -166,7 +167,29 @@ class Motion(Table):
             self._check_designed_law(scene)
         self._check_limits()
         if scene.is_spatial:
-            return  # `tables.joints` knows
+            self._check_in_space(scene)
+        else:
+            self._check_in_plane(scene)
+
+    def _check_in_space(self, scene: Scene) -> None:
+        """Refuse paths that only a machine in the plane has, and joints that nothing asks for."""
+        if self.path not in PATHS:
+            allowed = " | ".join(map(shown, PATHS))
+            raise Refusal(f"expected {allowed} with [[joints]]", ".path", "joints")
+        for key in ("start", "end"):
+            if self.path == "line" and len(getattr(self, key)) == 2:
+                raise Refusal(
+                    "expected an array of three numbers with [[joints]]", f".{key}", "joints"
+                )
+        if self.path == "joints" and not scene.closures:
+            reason = 'with motion.path = "joints", which does not use it without [[closures]]'
+            self.refuse_stated(".initial_joints", reason, ".path")
+        refuse_count(
+            self.initial_joints, [joint.name for joint in scene.movable], ".initial_joints"
+        )
+
+    def _check_in_plane(self, scene: Scene) -> None:
+        """Refuse what a single joint cannot do, and joints that a rotation leaves open."""
         turns = self.path == "rotation"
         if not scene.closures:
             if turns or self.path == "joints":

@@ -245,36 +245,21 @@ class Constraints(Table):
         for index, var in enumerate(vars(self)["stiffness"] or ()):
             var.check_at(scene, ("constraints", "stiffness", index))
         self._check_delay(scene.motion)
-        self._check_poles(scene)
-        self._check_arms(scene)
-
-    def _check_arms(self, scene: Scene) -> None:
-        """Refuse responses of flexible arms where there are none."""
         for response in asked(scene):
-            where = f".{response.key}" if response.key in self.limits else "objective.kind"
-            if response.of_arms and not scene.cell_counts:
-                raise Refusal("expected another response: no arm is flexible", where)
-            for name, kind in scene.without_strength.items() if response.name == "stress" else ():
+            if reason := _excluded(response, scene):
                 raise Refusal(
-                    f"expected another response: {name} is {kind}, and no strength criterion is "
-                    "known for that; limit deviation or buckling",
-                    where,
+                    f"expected another response{reason}",
+                    f".{response.key}" if response.key in self.limits else "objective.kind",
+                    *["closures.0.kind"] * scene.is_pinned,
                 )
+        self._check_poles(scene)
 
     def _check_poles(self, scene: Scene) -> None:
-        """Refuse responses of poles without a closed loop, and options of none."""
-        used = [response.name for response in asked(scene) if "poles_at" in response.options]
-        if not used:
+        """Refuse instants of poles that nothing uses, or beyond the motion."""
+        if not any("poles_at" in response.options for response in asked(scene)):
             reason = "without constraints.damping_ratio or pole_frequency: nothing else uses it"
             self.refuse_stated(".poles_at", reason)
             return
-        where = f".{used[0]}" if used[0] in self.limits else "objective.kind"
-        if scene.control is None:
-            raise Refusal(
-                "expected another response without [control]: poles are those of the closed loop; "
-                "add the table, or take first_frequency",
-                where,
-            )
         instants = self.pole_instants(scene.motion)
         horizon = scene.motion.horizon
         if sorted(set(instants)) != list(instants) or not instants or instants[-1] > horizon:
@@ -321,6 +306,32 @@ class Constraints(Table):
         if cases == ():
             raise Refusal("expected at least one table [[constraints.stiffness]]")
         return cases
+
+
+# Responses of the deviation at the end of the chain, which a pin in the plane leaves none.
+OF_THE_END = ("deviation", "settling")
+
+
+def _excluded(response: Declaration, scene: Scene) -> str:
+    """Return why a scene's machine has no such response, "" where it has."""
+    if response.of_arms and not scene.cell_counts:
+        return ": no arm is flexible"
+    if response.name in OF_THE_END and scene.is_pinned:
+        return (
+            " with a pin: the end of the last arm is held, it deviates from nothing; take the "
+            "compliance"
+        )
+    if "poles_at" in response.options and scene.control is None:
+        return (
+            " without [control]: poles are those of the closed loop; add the table, or take "
+            "first_frequency"
+        )
+    for name, kind in scene.without_strength.items() if response.name == "stress" else ():
+        return (
+            f": {name} is {kind}, and no strength criterion is known for that; limit deviation or "
+            "buckling"
+        )
+    return ""
 
 
 def _add_keys() -> None:
