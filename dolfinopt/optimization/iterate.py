@@ -145,7 +145,10 @@ class Iterate:
         """
         size = abs(self.problem.f0) or 1.0
         merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
-        rises = self.projection.rises(self.problem.excess)
+        # Where the eroded design exceeds its own limits by half, its members are about to break:
+        # else feed_forward.toml ends with no step that leads on.
+        apart = (self.problem.f > 0.5).any()
+        rises = not apart and self.projection.rises(self.problem.excess)
         shorter = 1.0
         for _ in range(STEP_ATTEMPTS):
             new, after = self._proposed(shorter * self.reach * self.projection.move)

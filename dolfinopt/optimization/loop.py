@@ -127,7 +127,8 @@ class Optimization:
                 self.initial_deviation = trajectory.deviation
             self._record()
             self._look_at_solid_arms()
-        while not self._finished() or self._goes_on():
+        # What is still to be done is looked for where nothing is gained any more.
+        while not self._finished() or self._uses_exact_gradient() or self._stiffens():
             self.iterate.step()
             if not self.iterate.stuck:
                 self._record()
@@ -176,10 +177,6 @@ class Optimization:
     @property
     def _begins_with_frozen_loads(self) -> bool:
         return self.scene.objective.gradient == "exact" and self.exact_from is None
-
-    def _goes_on(self) -> bool:
-        """Look for what is still to be done where nothing is gained any more (collective)."""
-        return self._uses_exact_gradient() or self._stiffens()
 
     def _uses_exact_gradient(self) -> bool:
         """Go over to the exact gradient where frozen loads have done their work (collective)."""

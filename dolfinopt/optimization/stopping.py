@@ -37,12 +37,12 @@ def stop_code(
         best: the best design so far.
         stuck: why no step leads on, "" where one does.
     """
+    feasible = best.excess == 0.0
     if stuck:
-        gained_nothing = best.excess == 0.0 and iteration - best.iteration >= WINDOW
-        return StopCode.SETTLED if gained_nothing else StopCode.STUCK
+        gains_nothing = feasible and iteration - best.iteration >= WINDOW
+        return StopCode.SETTLED if gains_nothing else StopCode.STUCK
     if iteration and iteration % (WINDOW // 4) == 0:
-        tolerance, feasible = scene.optimizer.tolerance, best.excess == 0.0
-        if progress.gain(WINDOW if feasible else 3 * WINDOW) <= tolerance:
+        if progress.gain(WINDOW if feasible else 3 * WINDOW) <= scene.optimizer.tolerance:
             return StopCode.SETTLED if feasible else StopCode.INFEASIBLE
     return StopCode.ITERATIONS if iteration >= scene.optimizer.max_iterations else None
 
