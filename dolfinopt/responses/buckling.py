@@ -69,8 +69,8 @@ class Pressed:
 def pressed(state: DesignState, loads: ArmLoads) -> list[Pressed]:
     """Return the instants that count (collective on the arm's ranks).
 
-    The modes at the instants of the largest strain energy tell at any other instant that mu is at
-    least their Ritz value: the instants that count are where that has its peaks.
+    The modes at the extremes of the loads tell at any other instant that mu is at least their Ritz
+    value: the instants that count are where that has its peaks.
     """
     a, fields = loads.coefficients / loads.stiffer, state.load_fields
     modulus = stressed_modulus(state)
@@ -80,20 +80,33 @@ def pressed(state: DesignState, loads: ArmLoads) -> list[Pressed]:
         stress = Prestress(fields, modulus, a[n : n + 1])
         return buckling_modes(stress, BUCKLING_MODES, 1.0 / LARGEST_FACTOR)
 
-    energies = state.elastic.energy_matrix(fields.columns)
-    first = worst_instants(np.einsum("nk,kl,nl->n", a, energies, a))
+    first = extreme_instants(a, state.elastic.energy_matrix(fields.columns))
     if not first:
         return []
     peaks = worst_instants(_ritz(state, a, [modes_at(n) for n in first]))
     return [Pressed(loads, n, modes_at(n)) for n in peaks]
 
 
+def extreme_instants(a: np.ndarray, energies: np.ndarray) -> list[int]:
+    """Return where the two principal loads of a motion are largest, either way.
+
+    What pulls one member presses another. Strain energy alone, which has no sign, misses members:
+    three times the mu in an eroded design of feed_forward.toml.
+
+    Args:
+        a: (n, k) coefficients of the loads.
+        energies: (k, k) twice the strain energy of a is a' energies a.
+    """
+    loads = a * np.sqrt(np.diag(energies))
+    principal = np.linalg.svd(loads, full_matrices=False)[2][:2]
+    ways = np.concatenate([principal, -principal]) @ loads.T
+    return sorted({int(way.argmax()) for way in ways if way.max() > 1e-6 * ways.max()})
+
+
 def worst_instants(values: np.ndarray) -> list[int]:
     """Return the highest peaks of values (n,), largest first."""
     around = np.concatenate([[0.0], np.maximum(values, 0.0), [0.0]])  # the ends may be peaks
     peaks = find_peaks(around)[0] - 1
-    if not around.any():
-        return []
     return list(map(int, peaks[np.argsort(-values[peaks], kind="stable")][:BUCKLING_PEAKS]))
 
 
