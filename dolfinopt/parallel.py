@@ -14,7 +14,7 @@ import pickle
 import sys
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -246,7 +246,7 @@ def _pickled(error: BaseException) -> bytes:
     return pickle.dumps(RuntimeError(type(error).__name__))
 
 
-def on_root(world: MPI.Comm, action: Any, *arguments: Any) -> Any:
+def on_root(world: MPI.Comm, action: Callable[..., T], *arguments: Any) -> T:
     """Run `action(*arguments)` on the root and hand its result, or its exception, to all ranks."""
     if world.size == 1:
         return action(*arguments)
@@ -254,7 +254,8 @@ def on_root(world: MPI.Comm, action: Any, *arguments: Any) -> Any:
         outcome = world.bcast(None, root=0)
         if isinstance(outcome, _Packed):
             raise outcome.exception() from outcome.cause()
-        return pickle.loads(outcome)
+        known: T = pickle.loads(outcome)
+        return known
     try:
         result = action(*arguments)
         data = pickle.dumps(result)

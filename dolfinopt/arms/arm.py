@@ -417,7 +417,7 @@ class Arm:
         def contacts_of_all() -> Contacts:
             return contacts_of(*map(np.concatenate, zip(*parts, strict=True)))
 
-        gathered: Contacts = on_root(mesh.comm, contacts_of_all)
+        gathered = on_root(mesh.comm, contacts_of_all)
         first = sum(mesh.comm.allgather(mesh.num_cells)[: mesh.comm.rank])
         return replace(gathered, kept=gathered.kept[first : first + mesh.num_cells])
 

@@ -139,8 +139,7 @@ def certify(
         stationary = bool(result.kkt <= scene.optimizer.kkt_tolerance)
         return replace(result, seconds=time.perf_counter() - begun, stationary=stationary)
 
-    certificate: Certificate = on_root(evaluator.partition.world, judged)
-    return certificate
+    return on_root(evaluator.partition.world, judged)
 
 
 def _problem_by(

@@ -145,10 +145,7 @@ class Iterate:
         """
         size = abs(self.problem.f0) or 1.0
         merit, before, start = self.problem.merit(size), self.projection.beta, self.evaluator.start
-        # Where the eroded design exceeds its own limits by half, its members are about to break:
-        # else feed_forward.toml ends with no step that leads on.
-        apart = (self.problem.f > 0.5).any()
-        rises = not apart and self.projection.rises(self.problem.excess)
+        rises = self.projection.rises(self.problem.excess)
         shorter = 1.0
         for _ in range(STEP_ATTEMPTS):
             new, after = self._proposed(shorter * self.reach * self.projection.move)
@@ -244,8 +241,7 @@ class Iterate:
 
     def _residual(self) -> Residual:
         """Return the Karush-Kuhn-Tucker residual, under the gradient in use (collective)."""
-        result: Residual = on_root(self.world, kkt_residual, *self._posed)
-        return result
+        return on_root(self.world, kkt_residual, *self._posed)
 
     # -- memory ------------------------------------------------------------------------------
 

@@ -138,8 +138,7 @@ def _ritz(state: DesignState, a: np.ndarray, known: Sequence[BucklingModes]) -> 
         of_instants = np.tensordot(a, W.T @ K0 @ W, 1)
         return np.asarray(np.linalg.eigvalsh(-of_instants)[:, -1])
 
-    result: np.ndarray = on_root(arm.comm, largest)
-    return result
+    return on_root(arm.comm, largest)
 
 
 def _of_design(state: DesignState, loads: Sequence[ArmLoads]) -> list[Pressed]:

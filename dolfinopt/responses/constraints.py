@@ -39,7 +39,7 @@ class Limit:
     @property
     def name(self) -> str:
         """Its column in history.csv and its key in summary.json, e.g. "first_frequency_arm2"."""
-        return f"{self.quantity}_{self.arm}".rstrip("_") if self.arm else self.quantity
+        return f"{self.quantity}_{self.arm}".rstrip("_")
 
     @property
     def excess(self) -> float:

@@ -327,5 +327,5 @@ def _stiffening(scene: Scene, partition: Partition, arms: Mapping[int, Arm]) -> 
         return largest_stiffness_change(other, bodies_in(scene, other, owned), t)
 
     every = scene, *pose_scenarios(scene)
-    change: float = on_root(partition.world, lambda: max(map(largest, every)))
+    change = on_root(partition.world, lambda: max(map(largest, every)))
     return Stiffening(change, change > STIFFNESS_CHANGE if stated == "auto" else stated)

@@ -69,11 +69,12 @@ class Eigenfrequency(Response):
         chain = _frozen(analysis)
         with together(partition.world):
             by_place = _by_place(scene, designs)
-            modes = _modes(by_place, chain)
-            own = {}
-            for place, mode in modes.items():
-                _, by_values = self.squared_period(mode)
-                own[place] = period_gradient(by_place[place], mode, by_values, analysis.by)
+            own = {
+                place: period_gradient(
+                    by_place[place], mode, self.squared_period(mode)[1], analysis.by
+                )
+                for place, mode in _modes(by_place, chain).items()
+            }
         by_carried = on_all_ranks(partition, {place: item[1] for place, item in own.items()})
         rows = []
         zero = list(map(np.zeros_like, chain.carried()))

@@ -51,11 +51,10 @@ def linearised_machine(
     @cache
     def machine(method: str, count: int) -> StateSpace:
         owned = reductions.bodies(reductions.reduced(method, count))
-        result: StateSpace = on_root(
+        return on_root(
             partition.world,
             lambda: state_space(simulate(scene, chain_of(scene, owned), profile), t),
         )
-        return result
 
     @cache
     def judged(count: int) -> StateSpace:

@@ -113,8 +113,7 @@ class Comparison:
 
     def __init__(self, reductions: Reductions):
         """Take the arms with their design."""
-        self.reductions, self.partition = reductions, reductions.partition
-        scene = reductions.scene
+        self.reductions, scene = reductions, reductions.scene
         self.scenes = [_timed(item) for item in (scene, *pose_scenarios(scene))]
         self.richer = 0  # coordinates
         self.bases: dict[int, Basis] = {}
@@ -137,26 +136,26 @@ class Comparison:
             motion = self._moved(bases)
         except ConvergenceError:
             return np.inf  # further ones may do
-        energy = gather_arms(self.partition, self.reductions.energies(bases, self.bases))
+        partition = self.reductions.partition
+        energy = gather_arms(partition, self.reductions.energies(bases, self.bases))
 
         def largest() -> float:
             assert motion is not None and self.motion is not None
             few, many = [motion, *motion.scenarios], [self.motion, *self.motion.scenarios]
             return max(_distance(self.scenes[0], *item, energy) for item in zip(few, many))
 
-        return on_root(self.partition.world, largest)
+        return on_root(partition.world, largest)
 
     def _moved(self, bases: Mapping[int, Basis]) -> Trajectory | None:
         """Return the root's motion of the scene with its scenarios (collective)."""
-        owned = self.reductions.bodies(bases)
-        return simulated_together(self.scenes, self.partition, owned, self.reductions.profile)
+        given, owned = self.reductions, self.reductions.bodies(bases)
+        return simulated_together(self.scenes, given.partition, owned, given.profile)
 
 
 def _timed(scene: Scene) -> Scene:
     """Return the scene simulated so well that time steps do not matter to the comparison."""
     tolerance = min(scene.simulation.tolerance, TIME_ERROR_SHARE * scene.reduction.tolerance)
-    update = {"tolerance": tolerance}
-    simulation = scene.simulation.unchecked_copy(update)
+    simulation = scene.simulation.unchecked_copy({"tolerance": tolerance})
     return scene.unchecked_copy({"simulation": simulation})
 
 
@@ -188,7 +187,7 @@ def _distance(
 
 def _norm(K: np.ndarray, q: np.ndarray) -> float:
     """Return the largest sqrt(q' K q) over the instants; q is (n, k)."""
-    return float(np.sqrt(max(np.einsum("nk,nk->n", q @ K, q).max(initial=0.0), 0.0)))
+    return float(np.sqrt(np.einsum("nk,nk->n", q @ K, q).max(initial=0.0)))
 
 
 # -- bases of any number of coordinates

@@ -85,7 +85,7 @@ class Mass(MaterialResponse):
         # Beside the rest of a robot what an optimisation gains would look like nothing.
         owners = scene.owners if self.limited else ()
         fixed = [place for place, owner in enumerate(owners) if owner is None]
-        rest: float = on_root(
+        rest = on_root(
             analysis.partition.world, lambda: sum(float(fixed_body(scene, k).mass) for k in fixed)
         )
         value = (float(self.sums(analysis)[0, 0]) + rest,)

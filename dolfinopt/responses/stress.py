@@ -356,11 +356,7 @@ class Stress(Response):
         """Screen all motions for the largest stress, and sum powers (collective)."""
         partition, p = analysis.partition, self.options.stress_exponent
         world = partition.world
-
-        def loads() -> dict[int, list[ArmLoads]]:
-            return arm_loads(analysis.scene, motions_of(analysis.motion))
-
-        by_owner: dict[int, list[ArmLoads]] = on_root(world, loads)
+        by_owner = on_root(world, lambda: arm_loads(analysis.scene, motions_of(analysis.motion)))
         points: dict[int, PointStress] = {}
         screened: dict[int, list[Screened]] = {}
         with together(world):
@@ -499,7 +495,7 @@ def through_motions(analysis: Analysis, mine: Mapping[int, ArmGradient]) -> Cell
 
         return over_motions(analysis, of_motion)
 
-    by_body: dict[int, Any] = on_root(partition.world, followed)
+    by_body = on_root(partition.world, followed)
     row = {}
     with together(partition.world):
         for k, item in mine.items():

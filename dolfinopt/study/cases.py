@@ -212,7 +212,7 @@ class Runner:
             self.computed += outcomes.computed
 
 
-def _advance(steps: Steps[T], outcomes: Outcomes) -> tuple[Sequence[Case] | None, T | None]:
+def _advance(steps: Steps[T], outcomes: Outcomes) -> tuple[Sequence[Case] | None, Any]:
     """Return the next cases of steps, or None and their end."""
     try:
         return steps.send(outcomes), None

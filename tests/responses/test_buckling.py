@@ -129,7 +129,7 @@ def test_pressure_is_found_between_stronger_tension(bar):
 
 @pytest.mark.serial
 def test_member_that_weaker_loads_press_is_found():
-    """A beam of two flanges: the stronger one is pressed by four peaks, the other by one of half."""
+    """A beam of two flanges: four peaks press the stronger one, one of half the other."""
     arm = arm_of((60, 12), "arms.passive=0.0")
     x, y = arm.mesh.centroid.T
     row = np.round((y - y.min()) / (y.max() - y.min()) * 11).astype(int)
