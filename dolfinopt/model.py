@@ -42,6 +42,7 @@ from dolfinopt.optimization.result import RankResult, Result
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output.design import (
     ArmView,
+    Designed,
     canonical_order,
     designed,
     gather_views,
@@ -380,18 +381,18 @@ class Model:
             InputError: it does not fit the scene's arms.
             ConvergenceError: the motion could not be simulated; the message says what to try.
         """
-        partition, arms, x_phys = self._prepared(x)
-        place = self._under_law(x), partition, arms, x_phys
+        place = self._prepared(x)
+        scene, partition, arms, x_phys = place
         choice = choose_coordinates(*place, self._profile)
         evaluation, trajectory = evaluate(*place, self._profile)
         result = stress_report(partition, arms, trajectory, self._profile) if stress else None
         views = gather_views(*place, result)
         points = [item.peak_at_points.value for item in (result or {}).values()]
         return SimulationResult(
-            scene=place[0],
+            scene=scene,
             evaluation=evaluation,
             trajectory=trajectory,
-            limits=limits_of(place[0], evaluation),
+            limits=limits_of(scene, evaluation),
             choice=choice,
             design=self._gathered(x_phys),
             views=views,
@@ -411,12 +412,11 @@ class Model:
         """
         if kind not in (None, *get_args(GradientKind)):
             raise InputError(f"kind {kind!r}: expected one of {', '.join(get_args(GradientKind))}")
-        scene = self.scene
-        scene.check_designed()
+        self.scene.check_designed()
+        scene, partition, arms, x_phys = self._prepared(x)
         if kind is not None:
             objective = scene.objective.unchecked_copy({"gradient": kind})
             scene = scene.unchecked_copy({"objective": objective})
-        partition, arms, x_phys = self._prepared(x)
         if needs(scene, "motion"):
             choose_coordinates(scene, partition, arms, x_phys, self._profile)
         _, trajectory = evaluate(scene, partition, arms, x_phys, self._profile, simulated=False)
@@ -434,16 +434,15 @@ class Model:
             InputError, ConvergenceError: as `simulate` does.
         """
         self.scene.check_designed()
-        partition, arms, x_phys = self._prepared(x)
-        if needs(self.scene, "motion"):
-            choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
-        place = self.scene, partition, arms
-        evaluation, trajectory = evaluate(*place, x_phys, self._profile, simulated=False)
-        analysis = analysis_of(*place, trajectory, self._profile)
+        scene, partition, arms, x_phys = place = self._prepared(x)
+        if needs(scene, "motion"):
+            choose_coordinates(*place, self._profile)
+        evaluation, trajectory = evaluate(*place, self._profile, simulated=False)
+        analysis = analysis_of(scene, partition, arms, trajectory, self._profile)
         rows = constraint_gradients(analysis, evaluation.responses)
         by_cells = [objective_gradient(analysis), *rows]
         zero = {k: np.zeros_like(x_phys[k]) for k in arms}
-        names = ["objective", *(limit.name for limit in limits_of(self.scene, evaluation))]
+        names = ["objective", *(limit.name for limit in limits_of(scene, evaluation))]
         values = [evaluation.objective, *evaluation.constraints]
         return Responses(
             dict(zip(names, values, strict=True)),
@@ -469,11 +468,9 @@ class Model:
         """
         from dolfinopt.responses.linearised_machine import linearised_machine
 
-        partition, arms, x_phys = self._prepared(x)
-        choose_coordinates(self.scene, partition, arms, x_phys, self._profile)
-        return linearised_machine(
-            self.scene, partition, arms, x_phys, t, self._profile, below=below
-        )
+        place = self._prepared(x)
+        choose_coordinates(*place, self._profile)
+        return linearised_machine(*place, t, self._profile, below=below)
 
     def optimize(
         self,
@@ -504,7 +501,7 @@ class Model:
 
         begun, place = time.perf_counter(), None if folder is None else Path(folder)
         partition, arms = self._arms()
-        first = None if x0 is None else self._prepared(x0)[2]
+        first = None if x0 is None else self._prepared(x0).x_phys
         built = partition, {k: arm.fresh() for k, arm in arms.items()}
         result = optimize(
             self.scene,
@@ -533,8 +530,8 @@ class Model:
 
         begun, place = time.perf_counter(), Path(folder)
         check = None if overwrite else partial(check_unused, place)
-        partition, arms, x_phys = self._prepared(result)
-        filtered = self._prepared(result.filtered)[2] if result.filtered else None
+        _, partition, arms, x_phys = self._prepared(result)
+        filtered = self._prepared(result.filtered).x_phys if result.filtered else None
         with together(self._world):
             for k, arm in arms.items():
                 arm.state(x_phys[k])
@@ -695,22 +692,27 @@ class Model:
         partition, arms = self._arms()
         return uniform_design(self.scene, partition, arms, density)
 
-    def _prepared(self, x: Design) -> tuple[Partition, dict[int, Arm], dict[int, np.ndarray]]:
-        """Return the arms, which forget earlier designs, and the densities of this rank's cells."""
+    def _prepared(self, x: Design) -> Designed:
+        """Return the scene under a design's law, and the arms, which forget earlier designs."""
         # A search for modes that set out from another design's would end in other last digits.
         partition, arms = self._arms()
         for arm in arms.values():
             arm.forget()
+        return Designed(self._under_law(x), partition, arms, self._densities(x))
+
+    def _densities(self, x: Design) -> dict[int, np.ndarray]:
+        """Return the densities of this rank's cells."""
+        partition, arms = self._arms()
         if x is None:
-            return partition, arms, self._uniform()
+            return self._uniform()
         if isinstance(x, SimulationResult):
             x = x.design
         if isinstance(x, (str, os.PathLike)):
-            return partition, arms, read_design(Path(x), partition, arms)
+            return read_design(Path(x), partition, arms)
         checked = on_root(self._world, self._checked, x)
         sizes = {k: partition.comm.allgather(arm.mesh.num_cells) for k, arm in arms.items()}
         parts = {k: np.cumsum([0, *size])[partition.comm.rank :] for k, size in sizes.items()}
-        return partition, arms, {k: checked[k][part[0] : part[1]] for k, part in parts.items()}
+        return {k: checked[k][part[0] : part[1]] for k, part in parts.items()}
 
     def _under_law(self, x: Design) -> Scene:
         """Return the scene, with the law of a design that has one."""

@@ -102,6 +102,8 @@ def test_run_is_resumed_in_the_same_bits_and_its_design_read_with_its_law(tmp_pa
     assert again["scene"]["motion"] == first["scene"]["motion"]
     assert again["max_deviation"] == pytest.approx(first["max_deviation"], rel=1e-4)  # other steps
     assert first["scene"]["motion"]["duration"] == files[0]["motion/duration"][0] != 1.9
+    model = do.Model(TWO_ARM, *QUICK, *DURATION, *wide)
+    assert model.evaluate(design).values["objective"] == files[0]["motion/duration"][0]
 
 
 @pytest.mark.parametrize(

@@ -80,12 +80,17 @@ def test_geometric_stiffness_is_that_of_the_reduction(bar):
         assert flat + theta.T @ stress.rotation[0, 0] @ theta == pytest.approx(expected, rel=1e-6)
 
 
+def rows():
+    """Return an arm, and for each of its cells where it is along it and in which row."""
+    arm = arm_of((60, 12), "arms.passive=0.0")
+    x, y = arm.mesh.centroid.T
+    return arm, x, np.round((y - y.min()) / (y.max() - y.min()) * 11)
+
+
 @pytest.mark.serial
 def test_void_in_a_closing_gap_does_not_buckle():
     """A tongue that nothing loads beside a beam that bends towards it, void between them."""
-    arm = arm_of((60, 12), "arms.passive=0.0")
-    x, y = arm.mesh.centroid.T
-    row = np.round((y - y.min()) / (y.max() - y.min()) * 11).astype(int)
+    arm, x, row = rows()
     solid = (row >= 8) | ((row >= 2) & (row <= 6) & (x < 0.9)) | (x < 0.02)
 
     def first(light, modulus=None):
@@ -130,9 +135,7 @@ def test_pressure_is_found_between_stronger_tension(bar):
 @pytest.mark.serial
 def test_member_that_weaker_loads_press_is_found():
     """A beam of two flanges: four peaks press the stronger one, one of half the other."""
-    arm = arm_of((60, 12), "arms.passive=0.0")
-    x, y = arm.mesh.centroid.T
-    row = np.round((y - y.min()) / (y.max() - y.min()) * 11).astype(int)
+    arm, x, row = rows()
     arm.state(np.where((row >= 9) | (row == 0) | (np.round(60 * x) % 10 == 0), 1.0, 1e-3))
     t = np.linspace(0.01, 0.99, 50)
     size = np.sin(5.0 * np.pi * t) ** 2 * np.where((t > 0.4) & (t < 0.6), -0.5, 1.0)
