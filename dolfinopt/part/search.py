@@ -105,7 +105,8 @@ class Search:
         """Begin at a state, after some steps."""
         self.problem, self.state, self.meshed = problem, state, state.outlines
         self.since, self.falls, self.steps = FOLLOWED, list[tuple[int, float]](), steps
-        self.radius, self.prices = FIRST_RADIUS, np.full(len(state.values) - 1, PRICE)
+        self.radius = FIRST_RADIUS
+        self.prices: np.ndarray = np.full(len(state.values) - 1, PRICE)
         self.H = np.zeros((0, 0))
         self.curvature: BFGS | None = None
         self.rows: dict[Place, tuple[np.ndarray, int]] = {}

@@ -90,9 +90,9 @@ def parse_vary(text: str) -> Vary:
         return Vary(key, tuple(dict.fromkeys(parts)), text)
     if count < 2 or start == stop:
         raise InputError(f"--vary {text}: expected at least two values between two ends")
-    steps = np.linspace(start, stop, count).tolist()
+    steps = np.linspace(start, stop, count)
     # Whole numbers are written as such: a key may be an integer.
-    return Vary(key, tuple(repr(step).removesuffix(".0") for step in steps), text)
+    return Vary(key, tuple(repr(float(step)).removesuffix(".0") for step in steps), text)
 
 
 def changed(scene: Scene, *overrides: str) -> Scene:

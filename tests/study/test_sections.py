@@ -111,7 +111,7 @@ def test_lower_limits_and_what_rises_with_the_mass(bars):
     """A frequency is held from a size on, drives up to one: the least size between them."""
 
     def values(shares):
-        s = max(shares)
+        s = math.prod(shares) ** 0.5  # alike at s1 = s2 alone: the least s1 + s2
         return Found({"first_frequency": 2.0 * s, "effort": 1.25 * s}, least={"first_frequency"})
 
     (found, holds), _ = search(bars, values)
