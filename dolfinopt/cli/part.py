@@ -204,16 +204,18 @@ class PartsJob:
         """Print what was made."""
         from dolfinopt.part.solid.part import SolidPart
 
-        scene, rough = self.scene, []
+        scene, rough, bodies = self.scene, [], []
         for arm, owner in zip(scene.arms, scene.owners, strict=True):
             if owner is None:
-                click.echo(f"{arm.name}: no part, it is rigid or comes from a file")
+                bodies.append(arm.name)
                 continue
             part = self.parts[owner]
             mass = scene.material_of(owner).density * part.volume
             click.echo(f"{arm.name}: {mass:.4g} kg, {part.sentence}")
             if isinstance(part, SolidPart) and part.flat is None:
                 rough.append(arm.name)
+        if bodies:
+            click.echo(f"no part of {', '.join(bodies)}: rigid or from a file")
         if self.check is not None:
             tell(self.check)
         if rough:

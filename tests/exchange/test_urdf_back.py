@@ -155,7 +155,9 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys):
     assert "The lightest tube wins." in written and "<td>round tube</td>" in written
     summary = summary_of(tmp_path / "run")
     check_limits(summary, tmp_path / "run" / "trajectory.csv")
-    before, after = read_robot(DEMO), read_robot(tmp_path / "run" / "urdf" / "robot.urdf")
+    lighter = tmp_path / "run" / "urdf" / "robot.urdf"
+    before, after = read_robot(DEMO), read_robot(lighter)
+    assert "-->\n<robot " in lighter.read_text()
     assert same_kinematics(before, after)
     fore = after.links["forearm"]
     assert fore.inertia.mass == pytest.approx(summary["mass"]["forearm"], rel=1e-12)
@@ -165,7 +167,7 @@ def test_from_the_robot_to_a_run_and_back(tmp_path, capsys):
     assert fore.inertia.centre == pytest.approx([-0.36435, 0.0, 0.06], abs=1e-9)
     assert fore.points.min(axis=0) == pytest.approx([-0.7287, -0.055, 0.005], abs=1e-3)
     assert implausible_inertias(after) == []
-    run_import(tmp_path / "run" / "urdf" / "robot.urdf", "forearm", DEMO_MOTION, tmp_path / "b")
+    run_import(lighter, "forearm", DEMO_MOTION, tmp_path / "b")
     trees = [tree_of(tmp_path / name / "robot.toml")["arms"] for name in "ab"]
     masses = [[(arm["name"], arm.get("mass")) for arm in tree] for tree in trees]
     assert masses[0] == masses[1]

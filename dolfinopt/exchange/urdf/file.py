@@ -503,7 +503,7 @@ def robot_text(file: Path, links: Sequence[NewLink], folder: Path) -> bytes:
                 new.append(material)
             _replace(element, new)
     text: bytes = etree.tostring(tree, xml_declaration=True, encoding="utf-8")
-    return text + b"\n"
+    return text.replace(b"--><", b"-->\n<", 1) + b"\n"  # lxml drops the line's end before the root
 
 
 def _replace(parent: Any, new: Any) -> None:
