@@ -127,10 +127,11 @@ def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]
     shell = ndimage.binary_fill_holes(shell)
     shell = ndimage.binary_erosion(shell, iterations=radius)
     shell = ndimage.binary_opening(shell, iterations=1)  # a sheet encloses nothing
-    if not shell.any():
+    inside = ndimage.gaussian_filter(shell.astype(float), 1.0)
+    if inside.max() <= SURFACE:  # nothing, or too thin
         return []
     image = _image(shell.shape, step, grid.translation - margin * step)
-    image["inside"] = ndimage.gaussian_filter(shell.astype(float), 1.0).ravel(order="F")
+    image["inside"] = inside.ravel(order="F")
     surface = image.contour([SURFACE], "inside")
     result = trimesh.Trimesh(surface.points, surface.regular_faces)
     _turn_outwards(result)
@@ -239,9 +240,8 @@ def _united(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> tuple[Trimesh, lis
         (dropped, f"{_pieces_of(dropped)} below {100 * TINY:g} % of its size left out"),
     ]
     closed += _within(left, closed) if left else []
-    if not closed:
+    if not closed or (solid := boolean.union(closed, check_volume=False)).is_empty:
         raise NoSolid("its geometry encloses nothing")
-    solid = boolean.union(closed, check_volume=False)
     if hollows:
         solid = boolean.difference([solid, *hollows], check_volume=False)
     return solid, [words for count, words in said if count]
