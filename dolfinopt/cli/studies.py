@@ -171,9 +171,8 @@ def reproduce(
         click.echo(f"{outcomes.computed} cases computed; figures{page} in {folder}")
 
     on_root(world, conclude)  # a rank that raised below meanwhile would end the root at its writing
-    failures = [f"{o.case.label}: {o.failure}" for o in outcomes.failures]
     judged = check or not (coarse or overrides)
-    if wrong := [*failures, *(paper.failed_checks(checks) if judged else ())]:
+    if wrong := [*outcomes.failures, *(paper.failed_checks(checks) if judged else ())]:
         raise ConvergenceError("; ".join(wrong))
 
 

@@ -38,7 +38,7 @@ from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import arms_with_design, read_history, under_law_of
-from dolfinopt.output.folders import working_alone
+from dolfinopt.output.folders import read_record, working_alone
 from dolfinopt.output.run_folder import optimize, simulated, write_result
 from dolfinopt.output.summary import figures, versions, write_summary
 from dolfinopt.parallel import on_root, together
@@ -115,6 +115,7 @@ class Outcome:
     case: Case
     folder: Path  # of its files
     failure: str = ""  # message, "" where it succeeded
+    failures: Sequence[str] = ()  # what failed, a line each
     objective: float = math.nan
     compliance: float = math.nan
     max_deviation: float = math.nan
@@ -123,9 +124,8 @@ class Outcome:
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
+    samples: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of `SAMPLED`
     summary: Mapping[str, Any] = field(default_factory=dict)  # content of summary.json
-    samples: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n,) of `SAMPLED`
-    messages: Mapping[int, str] = field(default_factory=dict)  # of samples that failed, by number
 
     def __str__(self) -> str:
         if self.failure:
@@ -138,17 +138,6 @@ class Outcome:
         elif self.case.action != "simulate":
             result = f"{len(self.case.samples)} samples"
         return f"{self.case.title}: {result}, {self.seconds:.1f} s"
-
-    @property
-    def failures(self) -> list[str]:
-        """What failed, a line each."""
-        if not self.messages:
-            return [f"{self.case.title}: {self.failure}"] if self.failure else []
-        case = self.case
-        names = {
-            k: f"{k} ({', '.join(sample)})" for k, sample in enumerate(case.samples, case.first)
-        }
-        return [f"{case.label}, sample {names[k]}: {text}" for k, text in self.messages.items()]
 
     @property
     def design(self) -> Path:
@@ -178,9 +167,9 @@ class Outcomes:
         return replace(self.by_case[case], case=case)
 
     @property
-    def failures(self) -> list[Outcome]:
-        """Those that failed."""
-        return [outcome for outcome in self.by_case.values() if outcome.failure]
+    def failures(self) -> tuple[str, ...]:
+        """What failed, a line each."""
+        return tuple(line for outcome in self.by_case.values() for line in outcome.failures)
 
 
 T = TypeVar("T")
@@ -314,7 +303,8 @@ SUMMARY, HISTORY, TRAJECTORY = "summary.json", "history.csv", "trajectory.npz"
 DEVIATION = "deviation.npz"  # t and deviation of a simulation whose other files are not kept
 IDLE = 0.02  # s between two looks for a job
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
-FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason")
+FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason", "samples", "failure",
+           "failures")  # fmt: skip
 
 Job = Sequence[Case]  # of the same arms and design, which one rank builds once
 
@@ -347,25 +337,18 @@ class _Place:
         return True
 
     def fail(self, case: Case, message: str, **more: Any) -> None:
-        """Keep why a case failed, for this run."""
-        write_text(self._failure(case), json.dumps({"message": message, **more}))
+        """Keep why a case failed, for this run: in a few words, and a line for all that failed."""
+        known = {"failure": message, "failures": [f"{case.title}: {message}"]}
+        write_text(self._failure(case), json.dumps(known | more))
 
     def read(self, case: Case) -> Outcome:
         """Read a case back."""
         failed = self._failure(case)
         path = failed if failed.exists() else self[case] / SUMMARY
         data = json.loads(path.read_text("utf-8"))
-        samples, messages = data.get("samples", {}), data.get("messages", {})
-        return Outcome(
-            case,
-            self[case],
-            data.get("message", ""),
-            **{name: data[name] for name in FIGURES if name in data},
-            seconds=data.get("seconds", {}).get("total", math.nan),
-            summary={} if path == failed else data,
-            samples={name: np.array(values, float) for name, values in samples.items()},
-            messages={int(k): text for k, text in messages.items()},
-        )
+        known = {name: data[name] for name in FIGURES if name in data}
+        known["seconds"] = data.get("seconds", {}).get("total", math.nan)
+        return Outcome(case, self[case], **known, summary=data)
 
     def check(self) -> None:
         """Tell of cases that have ended; raise OthersFailed if another rank has failed."""
@@ -428,13 +411,8 @@ def _begin(place: _Place, wanted: Sequence[Case]) -> list[bool]:
 
 def _is_complete(folder: Path, keep: bool) -> bool:
     """Tell whether a case is done, with all its files where they are to be kept."""
-    if keep and (folder / DEVIATION).exists():
-        return False
-    try:
-        json.loads((folder / SUMMARY).read_text("utf-8"))["seconds"]["total"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return True
+    brief = keep and (folder / DEVIATION).exists()
+    return not brief and "seconds" in read_record(folder / SUMMARY)
 
 
 # -- who does what ---------------------------------------------------------------------------
@@ -548,19 +526,20 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
         scaled = scales_bodies(scene, keys)
         if scaled and nominal is None:
             (nominal,) = simulate_scenarios([scene], design)
-        rows, messages = [], {}
+        rows, failures = [], []
         result = simulate_samples(nominal if scaled else None, scenes, design)
         for number, trajectory in enumerate(result, case.first):
             if isinstance(trajectory, ConvergenceError):
-                messages[number] = str(trajectory)
+                sample = f"{number} ({', '.join(case.samples[number - case.first])})"
+                failures.append(f"{case.label}, sample {sample}: {trajectory}")
                 rows.append((math.nan,) * len(SAMPLED))
             else:
                 worst = worst_instants(trajectory, trajectory.scene.objective.load_cases)
                 compliance = float(trajectory.compliance[worst].sum())
                 rows.append((compliance, *trajectory.max_deviation))
         samples = dict(zip(SAMPLED, np.transpose(rows).tolist(), strict=True))
-        if messages:
-            place.fail(case, f"{len(messages)} samples", samples=samples, messages=messages)
+        if failures:
+            place.fail(case, f"{len(failures)} samples", samples=samples, failures=failures)
         else:
             folder, wall = place[case], time.perf_counter() - begun
             make_folder(folder)

@@ -135,8 +135,7 @@ def reported(name: str, rows: Rows, report: Callable[[pd.DataFrame], Report]) ->
     tables, figures = report(
         pd.DataFrame({**labels, **results_of(outcomes[case])} for labels, case in rows)
     )
-    failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)
-    return Study(name, tuple(tables), tuple(figures), failures)
+    return Study(name, tuple(tables), tuple(figures), outcomes.failures)
 
 
 def results_of(outcome: Outcome) -> dict[str, Any]:

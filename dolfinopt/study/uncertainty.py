@@ -449,7 +449,7 @@ def _range(table: str, name: str) -> tuple[float, float]:
 def _report(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -> Report:
     """Return tables and figures of the samples' values (n, d), and a table of all samples."""
     tables = [_input_table(inputs)]
-    if any(o.failure and not o.messages for o in frame["outcome"]):  # a design is missing
+    if any(o.failure and not o.samples for o in frame["outcome"]):  # a design is missing
         return tables, []
     samples, axes = _samples(frame, inputs, values), [item.axis for item in inputs]
     figures: list[Figure] = []
