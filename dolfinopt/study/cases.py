@@ -400,19 +400,16 @@ def _begin(place: _Place, wanted: Sequence[Case]) -> list[bool]:
         shutil.rmtree(left, ignore_errors=True)
     make_folder(place.cases)
     make_folder(place.work)
-    done = [_is_complete(place[case], place.keep or case.action != "simulate") for case in wanted]
-    for case, there in zip(wanted, done, strict=True):
-        if not there and case.action == "optimize":
-            (place[case] / SUMMARY).unlink(missing_ok=True)  # its checkpoint stays
-        elif not there:
-            shutil.rmtree(place[case], ignore_errors=True)
+    done = []
+    for case in wanted:
+        folder = place[case]
+        brief = place.keep and (folder / DEVIATION).exists()
+        done.append(not brief and "seconds" in read_record(folder / SUMMARY))
+        if not done[-1] and case.action == "optimize":
+            (folder / SUMMARY).unlink(missing_ok=True)  # its checkpoint stays
+        elif not done[-1]:
+            shutil.rmtree(folder, ignore_errors=True)
     return done
-
-
-def _is_complete(folder: Path, keep: bool) -> bool:
-    """Tell whether a case is done, with all its files where they are to be kept."""
-    brief = keep and (folder / DEVIATION).exists()
-    return not brief and "seconds" in read_record(folder / SUMMARY)
 
 
 # -- who does what ---------------------------------------------------------------------------
