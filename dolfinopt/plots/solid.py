@@ -203,17 +203,11 @@ def _size_of(name: str, box: Box) -> str:
     return f"{name}:  {x:.4g} x {y:.4g} x {z:.4g} mm"
 
 
-def _seen(box: Box) -> Box:
-    """Return the lowest and highest place (2,) of a box in the camera's plane, m."""
-    seen = LINKS.plane(box_corners(*box))
-    return seen.min(axis=0), seen.max(axis=0)
-
-
 def box_rows(boxes: Sequence[Box], title: str, foot: float = 0.0) -> tuple[Figure, list[Axes]]:
     """Return a figure and axes for the boxes (lowest and highest corner (3,), m) of links."""
-    return stacked_axes(
-        [_seen(box) for box in boxes], title, above=0.4, below=0.5, foot=foot, least=0.3
-    )
+    seen = [LINKS.plane(box_corners(*box)) for box in boxes]
+    flat = [(places.min(axis=0), places.max(axis=0)) for places in seen]
+    return stacked_axes(flat, title, above=0.4, below=0.5, foot=foot, least=0.3)
 
 
 def draw_link(

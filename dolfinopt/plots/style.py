@@ -75,11 +75,6 @@ def shortened(name: str) -> str:
 # -- scales ----------------------------------------------------------------------------------
 
 
-def spans_decade(values: np.ndarray) -> bool:
-    """Return whether positive values differ by more than a factor of ten: drawn on a log scale."""
-    return bool(np.min(values) > 0.0 and np.max(values) > 10.0 * np.min(values))
-
-
 def log_scale(axes: Axes, values: np.ndarray) -> None:
     """Make y logarithmic for positive values, labelled with plain numbers."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter

@@ -24,13 +24,6 @@ CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
 
 
-def draw_study(study: tables.Study, folder: Path) -> list[Path]:
-    """Draw every figure of a study as FOLDER/<study>[_<figure>].png; return the paths."""
-    return draw_all(
-        {tables.joined(study.name, figure.name): figure for figure in study.figures}, folder
-    )
-
-
 def draw_all(figures: Mapping[str, tables.Figure], folder: Path) -> list[Path]:
     """Draw figures in common looks as FOLDER/<name>.png; return the paths."""
     styles = common_looks(figures.values())
