@@ -26,6 +26,7 @@ the link, for zero as far as the rest of the file allows it: exact in the limit 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -82,14 +83,15 @@ def to_sid(body: ShapeIntegrals, comment: str = "") -> sid.StandardInputData:
 def _node(name: str, point: np.ndarray, modes: np.ndarray, K0: np.ndarray) -> sid.Node:
     """Return a node from its place, its displacements and rotations (6, q) and their K0."""
     q, (phi, psi) = modes.shape[1], np.split(modes, 2)
+    general = partial(sid.taylor, nq=q, structure=sid.GENERAL)
     phi_q, psi_q = np.split(_clean(-K0), 2) if len(K0) else (None, None)
     turn = _clean(skew(psi.T)).transpose(1, 0, 2)  # row, coordinate, column
     return sid.Node(
         name=name,
         rframe="body ref",
-        origin=sid.taylor(point[:, None], phi[:, :, None].copy(), nq=q, structure=sid.GENERAL),
-        phi=sid.taylor(phi, phi_q, nq=q, structure=sid.GENERAL),
-        psi=sid.taylor(psi, psi_q, nq=q, structure=sid.GENERAL),
+        origin=general(point[:, None], phi[:, :, None].copy()),
+        phi=general(phi, phi_q),
+        psi=general(psi, psi_q),
         AP=sid.taylor(ONE, turn, nq=q, structure=sid.GENERAL if turn.any() else sid.UNIT),
     )
 

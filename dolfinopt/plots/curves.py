@@ -205,9 +205,7 @@ def _drive_rows(trajectory: Trajectory) -> Iterator[list[Panel]]:
 
     def panel(label: str, unit: str, values: np.ndarray) -> Panel:
         shown, factor = SHOWN.get(unit, (unit, 1.0))
-        line = Line("", trajectory.t, factor * values)
-        note = f"largest {np.abs(line.y).max():.3g}"
-        return Panel(f"{label} [{shown}]", TIME, "", (line,), y_log=False, note=note)
+        return _over_time(f"{label} [{shown}]", Line("", trajectory.t, factor * values))
 
     scene, words = trajectory.scene, {"N": "force", "N m": "moment"}
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
@@ -219,6 +217,12 @@ def _drive_rows(trajectory: Trajectory) -> Iterator[list[Panel]]:
     for name, sizes in trajectory.closure_sizes.items():
         if name not in scene.driven:  # a driven rod's is its drive's
             yield [panel(f"{name}: {words[unit]}", unit, size) for unit, size in sizes.items()]
+
+
+def _over_time(label: str, *lines: Line) -> Panel:
+    """Return curves over time under a label, with the largest value of the first one."""
+    note = f"largest {np.abs(lines[0].y).max():.3g}"
+    return Panel(label, TIME, "", lines, y_log=False, note=note)
 
 
 # -- the law of the motion -----------------------------------------------------------------------
@@ -235,9 +239,8 @@ def law_figure(scene: Scene) -> Figure:
     rows = []
     for k, word in enumerate(("way", "speed", "acceleration")):
         pairs = ("designed", length * designed[k]), (motion.law, length * plain[k])
-        lines = tuple(Line(name * (k == 0), t, values) for name, values in pairs)
-        note = f"largest {np.abs(lines[0].y).max():.3g}"
-        rows.append([Panel(f"{word} [{units[k]}]", TIME, "", lines, y_log=False, note=note)])
+        lines = (Line(name * (k == 0), t, values) for name, values in pairs)
+        rows.append([_over_time(f"{word} [{units[k]}]", *lines)])
     return panel_figure("Law along the path", rows, width=WIDE)
 
 

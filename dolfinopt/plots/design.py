@@ -65,7 +65,7 @@ def design_figure(
     from dolfinopt.plots.solid import caption
 
     thickest = max((MILLI * float(v.wall.max()) for v in views if v.wall is not None), default=0.0)
-    marks = round_marks(0.0, thickest or 1.0, 5)
+    marks = round_marks(thickest)
     figure, rows = _panels(views, title, thickest > 0.0)
     for axes, view in zip(rows, views, strict=True):
         wall = None if view.wall is None else MILLI * view.wall
@@ -108,13 +108,17 @@ def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     figure, rows = _panels(views, title, True)
     stresses = [MEGA * view.stress for view in views if view.stress is not None]
     largest = max(float(stress.max()) for stress in stresses)
-    marks = round_marks(0.0, largest or 1.0, 5)
+    marks = round_marks(largest)
     for axes, view, stress in zip(rows, views, stresses, strict=True):
         _draw_arm(axes, view, stress, STRESS_COLOURS, marks[-1])
         worst, when = int(np.argmax(stress)), view.stress_instant
         assert when is not None
         if stress[worst] == largest > 0.0:
-            place = _flat(view, view.centroid[worst])
+            place = view.centroid[worst]
+            if is_solid(views):
+                from dolfinopt.plots.solid import LINKS
+
+                place = LINKS.plane(place)
             axes.plot(*place, "o", mfc="none", mec=BLUE, mew=1.8, ms=13.0, clip_on=False)
         places = zip("xyz", MILLI * view.centroid[worst])
         where = ", ".join(f"{name} = {value:.4g}" for name, value in places)
@@ -227,15 +231,6 @@ def _draw_arm(
     fill_cells(axes, view.corners, values, colours, largest)
     rim: Any = sides(view.corners)[boundary(view.corners)]
     axes.add_collection(LineCollection(rim, colors=GREY, linewidths=1.0), autolim=False)
-
-
-def _flat(view: ArmView, point: np.ndarray) -> np.ndarray:
-    """Return where a point of an arm (d,), m, is in its axes."""
-    if not is_solid([view]):
-        return point
-    from dolfinopt.plots.solid import LINKS
-
-    return LINKS.plane(point)
 
 
 def _arm_rows(

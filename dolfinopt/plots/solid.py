@@ -35,6 +35,7 @@ LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
 Colour = str | tuple[float, float, float]
 SIDES = 60  # of a round bar
+LINE = 2.0  # px
 EDGE = 35.0  # degrees between faces from which an edge stays sharp
 SHADED = {"smooth_shading": True, "split_sharp_edges": True, "feature_angle": EDGE, "ambient": 0.3,
           "diffuse": 0.85, "specular": 0.1}  # fmt: skip
@@ -105,11 +106,11 @@ class Studio:
                 look |= {"ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
             self.add(mesh, **look)
 
-    def line(self, points: np.ndarray, colour: Colour, width: float = 1.0) -> None:
-        """Draw line segments (n, 2, 3), m; `width` px."""
-        if len(points):
-            mesh = pyvista.line_segments_from_points(points.reshape(-1, 3))
-            self.plotter.add_mesh(mesh, color=colour, line_width=width, lighting=False, **PLAIN)
+    def line(self, points: np.ndarray, colour: Colour) -> None:
+        """Draw the line through points (n, 3), m; nothing of a single one."""
+        if len(points) > 1:
+            mesh = pyvista.lines_from_points(points)
+            self.plotter.add_mesh(mesh, color=colour, line_width=LINE, lighting=False, **PLAIN)
 
     def bar(self, ends: np.ndarray, radius: float, colour: Colour = BAR) -> None:
         """Draw a round bar between two points (2, 3), m; nothing where they coincide."""

@@ -87,7 +87,7 @@ class SolidStage:
 
     def path(self, points: np.ndarray, colour: str) -> None:
         """Draw the line through points (n, 3), m."""
-        self.studio.line(np.stack([points[:-1], points[1:]], axis=1), colour, 2.0)
+        self.studio.line(points, colour)
 
     def pose(self, n: int, strength: float = 1.0) -> None:
         """Draw links, rigid bodies, joints and load at an instant."""

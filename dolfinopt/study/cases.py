@@ -70,9 +70,9 @@ class Case:
     scene: Scene  # complete; its name does not matter
     action: Action = "simulate"
     design: Case | Path | None = None  # given; of an optimising case, of a file, or the initial one
-    label: str = field(default="", compare=False)  # what progress and messages call it
+    label: str = ""  # what progress and messages call it
     samples: tuple[tuple[str, ...], ...] = ()  # what each changes, "key.path=value" each
-    first: int = field(default=0, compare=False)  # number of the first sample, for messages
+    first: int = 0  # number of the first sample, for messages
 
     @cached_property
     def key(self) -> str:
