@@ -299,7 +299,7 @@ def _trajectory(result: RankResult) -> Trajectory:
 
 
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name
-SUMMARY, HISTORY, TRAJECTORY = "summary.json", "history.csv", "trajectory.npz"
+SUMMARY, TRAJECTORY = "summary.json", "trajectory.npz"
 DEVIATION = "deviation.npz"  # t and deviation of a simulation whose other files are not kept
 IDLE = 0.02  # s between two looks for a job
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
@@ -472,20 +472,19 @@ def _do(job: Job, place: _Place) -> None:
 def _optimise(case: Case, place: _Place) -> None:
     """Optimise, from the checkpoint of an interrupted run if there is one."""
     begun, folder, scene = time.perf_counter(), place[case], _unnamed(case)
-    resume, earlier = True, 0.0
+    resume = True
     try:
         checkpoint.check(folder, scene)
     except InputError:  # none, damaged, or made when a file of the scene was elsewhere
         resume = False
-    if resume and (folder / HISTORY).exists() and (rows := read_history(folder / HISTORY)):
-        earlier = rows[-1].seconds
     how: dict[str, Any] = {"resume": resume, "overwrite": not resume, "world": MPI.COMM_SELF}
     try:
         result = optimize(scene, folder, **how, report=lambda row: place.check())
     except ConvergenceError as error:
         place.fail(case, str(error))
         return
-    write_result(folder, result, earlier + time.perf_counter() - begun, paraview=False)
+    wall = max(time.perf_counter() - begun, result.rows[-1].seconds)  # before a resume, too
+    write_result(folder, result, wall, paraview=False)
 
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:

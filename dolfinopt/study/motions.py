@@ -170,7 +170,7 @@ def report(frame: pd.DataFrame, scene: Scene) -> Report:
         "finer model [mm]",
         "settling [mm]",
     ]
-    further = pd.DataFrame([_further(scene, outcome.summary) for outcome in frame["outcome"]])
+    further = pd.DataFrame(_further(scene, outcome.summary) for outcome in frame["outcome"])
     table = Table(
         "", f"{_verdict(able)} {NOTE}", with_failures(frame, frame[columns].join(further))
     )
