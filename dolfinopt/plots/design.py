@@ -149,12 +149,11 @@ def parts_figure(
         from dolfinopt.plots.solid import surfaces_figure
 
         solids = [part for part in parts if isinstance(part, (SolidPart, HollowPart))]
-        notes = [
-            [f"volume {1e6 * part.volume:.4g} cm3", f"mass {mass:.4g} kg", *part.width_words]
-            for part, mass in zip(solids, masses, strict=True)
-        ]
-        names, surfaces = zip(*((part.name, part.surface) for part in solids), strict=True)
-        return surfaces_figure(names, surfaces, notes, title)
+        noted = []
+        for part, mass in zip(solids, masses, strict=True):
+            notes = [f"volume {1e6 * part.volume:.4g} cm3", f"mass {mass:.4g} kg"]
+            noted.append((part.name, part.surface, [*notes, *part.width_words]))
+        return surfaces_figure(noted, title)
     corners = [MILLI * part.domain.corners for part in plates]
     words = "part" if own else "part over density"
     foot = LABEL_FOOT if own else LABEL_FOOT + SCALE_FOOT
@@ -182,12 +181,13 @@ def figure_of_plates(parts: Sequence[PlanePart]) -> Figure:
     """Return a picture of parts as plates below each other, seen from the right and above."""
     from dolfinopt.plots.solid import Surface, surfaces_figure
 
-    surfaces, notes = [], []
+    noted = []
     for part in parts:
         corners = part.facets.reshape(-1, 3)
-        surfaces.append(Surface(corners, np.arange(len(corners)).reshape(-1, 3)))
-        notes.append([f"{len(part.shape.loops) - 1} holes", f"{len(part.shape.curves)} curves"])
-    return surfaces_figure([part.name for part in parts], surfaces, notes, "")
+        surface = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
+        notes = [f"{len(part.shape.loops) - 1} holes", f"{len(part.shape.curves)} curves"]
+        noted.append((part.name, surface, notes))
+    return surfaces_figure(noted, "")
 
 
 def is_solid(views: Sequence[ArmView]) -> bool:

@@ -171,13 +171,11 @@ def draw_length(axes: Axes, at: np.ndarray, length: float, above: float) -> None
     axes.text(at[0] + 0.5 * length, at[1] + above, f"{1e3 * length:.6g} mm", ha="center")
 
 
-def surfaces_figure(
-    names: Sequence[str], surfaces: Sequence[Surface], notes: Sequence[Sequence[str]], title: str
-) -> Figure:
+def surfaces_figure(parts: Sequence[tuple[str, Surface, Sequence[str]]], title: str) -> Figure:
     """Return the picture of parts below each other, to one scale, each under its size and notes."""
-    boxes = [(item.points.min(axis=0), item.points.max(axis=0)) for item in surfaces]
+    boxes = [(item.points.min(axis=0), item.points.max(axis=0)) for _, item, _ in parts]
     figure, panels = box_rows(boxes, title)
-    for name, surface, words, box, axes in zip(names, surfaces, notes, boxes, panels, strict=True):
+    for (name, surface, words), box, axes in zip(parts, boxes, panels, strict=True):
         _draw_boxed(axes, box, surface, edges=False, color=STEEL)
         axes.set_title(", ".join([_size_of(name, box), *words]))
     return figure

@@ -65,7 +65,6 @@ class SolidStage:
         for place in poses.origin[0, [parent == GROUND for parent in poses.parents]]:
             self.studio.bar(np.stack([foot, place]), 2.0 * ROD * self.size)
         self.image = self.studio.show(self.studio.render())
-        self.keep()
 
     def _foot(self) -> np.ndarray:
         """Return where the machine stands (3,), m: as high as the world's origin, or lower."""

@@ -254,7 +254,7 @@ def polynomial_indices(
         fits.append((degree, powers, *_fit(basis, spread)))
     degree, powers, coefficients, without, missed = min(fits, key=lambda fit: fit[-1])
     shares, leaving = _shares(powers, coefficients[None])[0], _shares(powers, without)
-    result = [_jackknife(share, others) for share, others in zip(shares, leaving.T)]
+    result = _jackknife(shares, leaving)
     return Indices(result[:dimensions], result[dimensions:], degree, missed)
 
 
@@ -282,12 +282,12 @@ def _shares(powers: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     return np.concatenate([squares @ alone, squares @ involved], axis=1) / variance
 
 
-def _jackknife(value: float, leaving: np.ndarray) -> Estimate:
-    """Return an index within [0, 1] with an interval from those (n,) that leave a sample out."""
+def _jackknife(indices: np.ndarray, leaving: np.ndarray) -> list[Estimate]:
+    """Return indices (m,) in [0, 1] with intervals from those (n, m) that leave a sample out."""
     # Source: Efron & Tibshirani (1993), 11.2, doi:10.1201/9780429246593.
-    n = len(leaving)
-    half = WIDE * math.sqrt((n - 1) / n * float(np.sum((leaving - leaving.mean()) ** 2)))
-    return Estimate(float(value), max(float(value) - half, 0.0), min(float(value) + half, 1.0))
+    half = WIDE * math.sqrt(len(leaving) - 1) * leaving.std(axis=0)
+    ends = np.maximum(indices - half, 0.0), np.minimum(indices + half, 1.0)
+    return [Estimate(*row) for row in np.stack([indices, *ends], axis=1).tolist()]
 
 
 # -- uncertainties of a scene --------------------------------------------------------------------
