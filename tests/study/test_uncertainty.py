@@ -64,10 +64,9 @@ def test_inputs_are_cut_off_at_the_range():
 def test_nominal_values_and_a_sample_out_of_reach():
     given = scene("arms.arm2.density=2600.0", "arms.arm2.thickness=0.02")
     nominal = {"payload.mass": 6.0, "arms.arm2.density": 2600.0, "arms.arm1.density": 2700.0,
-               "arms.1.thickness": 0.02, "arms.density": np.nan, "arms.height": 0.06}  # fmt: skip
-    assert {key: nominal_value(given, key) for key in nominal} == pytest.approx(
-        nominal, rel=0.0, nan_ok=True
-    )
+               "arms.1.thickness": 0.02, "arms.height": 0.06}  # fmt: skip
+    assert {key: nominal_value(given, key) for key in nominal} == nominal
+    assert np.isnan(nominal_value(given, "arms.density"))
     assert with_sample(scene(), (), 0) == scene()
     words = "--random", "sample 2", "motion.radius=5.0"
     refusal(lambda: with_sample(scene(), ("motion.radius=5.0",), 2), *words)
@@ -171,8 +170,7 @@ def test_failures_are_told_and_tried_again(chunks, given, tmp_path, monkeypatch)
         with pytest.raises(ConvergenceError, match=r"sample \d+ \(payload.*\): too heavy \(and"):
             run(TWO_ARM, "--random", MASS, "--samples", 10, "--design", given, *overrides(*SMALL),
                 "--out", tmp_path / "f")  # fmt: skip
-    for k, line in zip(heavy, failures, strict=True):
-        assert f"sample {k} (payload.mass=" in line and line.endswith("): too heavy")
+    assert [line.split()[2] for line in failures] == [*map(str, heavy)]
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(found[0])), heavy)
     rows = rows_of(tmp_path / "f" / "uncertainty_payload.mass.csv")
     assert len(rows) == 10 and "" in {row["solid: compliance [N m]"] for row in rows}
