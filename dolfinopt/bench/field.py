@@ -16,14 +16,16 @@ import numpy as np
 import pandas as pd
 from mpi4py import MPI
 from pydantic import ConfigDict, ValidationError
+from scipy.linalg import eigh
 
 from dolfinopt.bench.measure import load_program
-from dolfinopt.data import benchmark_folder, tomllib
+from dolfinopt.data import benchmark_folder
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.errors import InputError
 from dolfinopt.model import Model, SimulationResult
 from dolfinopt.multibody.kinematics import Posed
 from dolfinopt.scene.tables.base import Table, input_error, problem
+from dolfinopt.scene.text import read_toml
 
 
 class Value(Table):
@@ -80,13 +82,11 @@ def read_cases() -> tuple[Case, ...]:
 
 def read_case(file: Path) -> Case:
     """Return the case of a file; InputError: it is no TOML, lacks a key or has an unknown one."""
+    tree = read_toml(str(file), "a case is a TOML file")
     try:
-        tree = tomllib.loads(file.read_text(encoding="utf-8"))
         return Case.model_validate(tree | {"folder": file.parent})
     except ValidationError as error:
         raise input_error(str(file), problem(error)) from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{file}: {error}; a case is a TOML file") from None
 
 
 def chosen_cases(names: Sequence[str], records: bool = False) -> tuple[Case, ...]:
@@ -125,10 +125,8 @@ def _frequency(number: int) -> Callable[[SimulationResult], float]:
 
     def value(result: SimulationResult) -> float:
         system = _trajectory(result).problem
-        still = np.zeros((1, system.num_coordinates))
-        matrix = system.at(np.zeros(1)).linearise(still, still, still).dense()[0]
-        K, _, M = np.split(matrix, 3, axis=1)
-        squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, K)).real)
+        K, M = system.mechanism.stiffness(), system.rest_mass[0]
+        squares = eigh(K, M, eigvals_only=True)
         return float(np.sqrt(squares[number - 1]) / (2.0 * np.pi))
 
     return value
@@ -242,14 +240,13 @@ def table_of(checks: Sequence[Checked]) -> pd.DataFrame:
     sign = {"near": "", "most": "at most +", "least": "at least -"}
     rows = [
         (
-            *(
-                item.case.name,
-                item.of.what,
-                item.of.unit,
-                f"{item.value:.6g}",
-                f"{item.reference:.6g}",
-            ),
-            *(f"{item.difference:.2g}", f"{sign[item.of.way]}{item.of.limit:g}"),
+            item.case.name,
+            item.of.what,
+            item.of.unit,
+            f"{item.value:.6g}",
+            f"{item.reference:.6g}",
+            f"{item.difference:.2g}",
+            f"{sign[item.of.way]}{item.of.limit:g}",
             "met" if item.met else "MISSED",
         )
         for item in checks

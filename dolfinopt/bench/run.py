@@ -17,6 +17,7 @@ from dolfinopt.bench.panel import Diagram, Frame, Row, curves, fitted_power, lea
 from dolfinopt.data import benchmark_folder
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
+from dolfinopt.output.folders import read_record
 from dolfinopt.study.tables import Table
 
 Tell = Callable[[str], None]
@@ -73,12 +74,8 @@ def measured(diagram: Diagram, plan: Plan, folder: Path, tell: Tell) -> tuple[li
     path = folder / f"{diagram.name}.json"
     asked = [source(), plan.quick, diagram.columns, plan.scene.to_dict()]
     stamp = json.loads(json.dumps(asked))
-    kept: dict[str, list[Row]] = {}
-    try:
-        result = json.loads(path.read_text(encoding="utf-8"))
-        kept = result["rows"] if result["stamp"] == stamp else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # not there, or cut off: measured anew
+    result = read_record(path)  # nothing where it is not there, or cut off: measured anew
+    kept: dict[str, list[Row]] = result["rows"] if result.get("stamp") == stamp else {}
     failures: list[str] = []
     for name, step in diagram.steps(plan):
         if name not in kept:

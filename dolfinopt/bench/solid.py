@@ -38,15 +38,14 @@ Found = tuple[int, str, list[float]]  # dofs of all ranks, solver, CPU seconds b
 def link_scene(scene: Scene, cells: Cells, static: bool = False) -> Scene:
     """Return the scene with one solid link, whatever its motion would be."""
     size = {"length": LENGTH, "height": HEIGHT, "thickness": THICKNESS, "cells": cells}
+    arm = scene.arms[0].unchecked_copy({**size, "element": "incompatible", "passive": 0.02})
     tables = {
-        "arms": {**size, "element": "incompatible", "passive": 0.02},
         "reduction": {"method": "craig-bampton", "coordinates": 6},
         "design": {"filter_radius": 1.5 * LENGTH / cells[0]},
         "objective": {"kind": "static"} if static else {},
     }
-    changed = {key: getattr(scene, key) for key in tables} | {"arms": scene.arms[0]}
-    result = {key: table.unchecked_copy(tables[key]) for key, table in changed.items()}
-    return scene.unchecked_copy(result | {"arms": (result["arms"],)})
+    changed = {key: getattr(scene, key).unchecked_copy(new) for key, new in tables.items()}
+    return scene.unchecked_copy({"arms": (arm,), **changed})
 
 
 def box_beam(centroid: np.ndarray) -> np.ndarray:

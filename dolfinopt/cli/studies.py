@@ -61,9 +61,9 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
             remove_stale(folder, listed_files(folder / f"{name}.json"))
             written = write_study(done, folder)
             if plots:
-                from dolfinopt.study.figures import draw_study
+                from dolfinopt.study.figures import draw_all
 
-                written += draw_study(done, folder)
+                written += draw_all(done.files, folder)
             _write_question(folder, name, asked, [path.name for path in written])
             click.echo(done.markdown())
             click.echo(f"{runner.computed} cases computed; tables and pictures in {folder}")
@@ -171,9 +171,8 @@ def reproduce(
         click.echo(f"{outcomes.computed} cases computed; figures{page} in {folder}")
 
     on_root(world, conclude)  # a rank that raised below meanwhile would end the root at its writing
-    failures = [f"{o.case.label}: {o.failure}" for o in outcomes.failures]
     judged = check or not (coarse or overrides)
-    if wrong := [*failures, *(paper.failed_checks(checks) if judged else ())]:
+    if wrong := [*outcomes.failures, *(paper.failed_checks(checks) if judged else ())]:
         raise ConvergenceError("; ".join(wrong))
 
 

@@ -34,17 +34,16 @@ def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegral
     if len(body.w) == 3:
         return body
     q = body.num_modes
-    w, point, K0, loads = np.zeros((3, 1 + q)), np.zeros(3), np.zeros((3, 3, q, q)), body.K0
+    w, point, loads, outboard = np.zeros((3, 1 + q)), np.zeros(3), body.K0, body.K0_outboard
     w[:2], point[:2] = body.w, body.outboard_point
     if W is None:
         W = np.zeros((9, 1 + q, 1 + q))
         W[0], W[1], W[3] = body.W[0], -0.5 * body.W[1], 0.5 * body.W[1]
     if body.is_stiffened:
-        push = np.concatenate([body.K0[:2], np.zeros((1, q, q))])
-        K0[1, 0], K0[0, 1] = 0.5 * body.K0[2], -0.5 * body.K0[2]
-        K0[0, 0] = K0[1, 1] = 0.5 * body.K0[3]
-        K0[2, 2] = -K0[0, 0]
-        loads = np.concatenate([push, K0.reshape(9, q, q)])
+        loads, outboard = np.zeros((12, q, q)), _with_rows(outboard)
+        loads[:2], turn, spin = body.K0[:2], 0.5 * body.K0[2], 0.5 * body.K0[3]
+        loads[[4, 6]] = -turn, turn  # K0_xy, K0_yx
+        loads[[3, 7, 11]] = spin, spin, -spin  # K0_xx, K0_yy, K0_zz
     return replace(
         body,
         w=w,
@@ -52,7 +51,7 @@ def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegral
         outboard=_with_rows(body.outboard),
         outboard_point=point,
         K0=loads,
-        K0_outboard=_with_rows(body.K0_outboard) if body.is_stiffened else body.K0_outboard,
+        K0_outboard=outboard,
         further_points=np.zeros((0, 3)),
     )
 

@@ -84,10 +84,10 @@ def lumped_nodes(arm: ElasticArm, basis: Basis, thickness: float) -> LumpedNodes
     # Sorted by x, then y. Nodes that ranks share have several shares of mass and the same motion.
     _, kept, place = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
     total = np.bincount(place.ravel(), weights=rows)
-    turning_mass = total * thickness**2 / 12.0
     points, modes = np.zeros((len(kept), 3)), np.zeros((len(kept), 6, V.shape[2]))
     points[:, :2], modes[:, :2] = places[kept], V[kept]
-    masses = np.stack([total, total, total, turning_mass, turning_mass, 0.0 * total], axis=1)
+    turning_share = thickness**2 / 12.0
+    masses = np.outer(total, [1.0, 1.0, 1.0, turning_share, turning_share, 0.0])
     return LumpedNodes(points, masses, modes)
 
 

@@ -26,6 +26,7 @@ the link, for zero as far as the rest of the file allows it: exact in the limit 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
 
@@ -82,14 +83,15 @@ def to_sid(body: ShapeIntegrals, comment: str = "") -> sid.StandardInputData:
 def _node(name: str, point: np.ndarray, modes: np.ndarray, K0: np.ndarray) -> sid.Node:
     """Return a node from its place, its displacements and rotations (6, q) and their K0."""
     q, (phi, psi) = modes.shape[1], np.split(modes, 2)
+    general = partial(sid.taylor, nq=q, structure=sid.GENERAL)
     phi_q, psi_q = np.split(_clean(-K0), 2) if len(K0) else (None, None)
     turn = _clean(skew(psi.T)).transpose(1, 0, 2)  # row, coordinate, column
     return sid.Node(
         name=name,
         rframe="body ref",
-        origin=sid.taylor(point[:, None], phi[:, :, None].copy(), nq=q, structure=sid.GENERAL),
-        phi=sid.taylor(phi, phi_q, nq=q, structure=sid.GENERAL),
-        psi=sid.taylor(psi, psi_q, nq=q, structure=sid.GENERAL),
+        origin=general(point[:, None], phi[:, :, None].copy()),
+        phi=general(phi, phi_q),
+        psi=general(psi, psi_q),
         AP=sid.taylor(ONE, turn, nq=q, structure=sid.GENERAL if turn.any() else sid.UNIT),
     )
 
@@ -285,7 +287,7 @@ def _plane_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.nda
     W[:, 1:, 1:] = 0.5 * (data.Me.M0 + data.Me.M0.T), 0.5 * (G - G.T)
     if not stiffened:
         return W, np.zeros((0, q, q))
-    turn = data.Cr.M1[:, :, 2] if data.Cr.order else np.zeros((q, q))  # its skew part is G
+    turn = _first_order(data.Cr)[:, :, 2]  # its skew part is G
     return W, np.stack([-turn, _centrifugal_excess(data, 2)])
 
 
@@ -359,6 +361,12 @@ def _unlike_arms(data: sid.StandardInputData, further: Sequence[str]) -> Iterato
             yield f"no node {name!r}; it has {', '.join(names)}"
 
 
+def _off(what: str, values: np.ndarray, of: np.ndarray | float, must: str) -> Iterator[str]:
+    """Yield what must be, where values that must be zero are not: to the rounding of `of`."""
+    if (most := np.abs(values).max(initial=0.0)) > FILE_ROUNDING_SHARE * np.max(np.abs(of)):
+        yield f"{what}: off by {most:.3g}; {must}"
+
+
 def _misplaced(first: sid.Node, tips: Sequence[sid.Node], dimension: int) -> Iterator[str]:
     """Yield where the frame is not held at the first node, or the others not parallel to it."""
     last = tips[0]
@@ -367,23 +375,20 @@ def _misplaced(first: sid.Node, tips: Sequence[sid.Node], dimension: int) -> Ite
         yield f"the outboard node {last.name} is at the origin"
     # The largest displacement by a coordinate, of the interface or by its rotation over the length.
     moved = max(np.abs(last.phi.M0).max(), length * np.abs(last.psi.M0).max())
-    scales = {"origin": length, "phi": moved, "psi": moved / length}
-    checks = [(first, name, getattr(first, name).M0, scale) for name, scale in scales.items()]
-    if dimension == 2:
-        across = {"origin": [2], "phi": [2], "psi": [0, 1]}
-        checks += [
-            (last, name, getattr(last, name).M0[across[name]], scales[name]) for name in across
-        ]
-    checks += [(node, "AP", node.AP.M0 - ONE, 1.0) for node in (first, *tips)]
-    for node, name, values, scale in checks:
-        which, must = "outboard", "in the plane z = 0"
-        if node is first:
-            which, must = "inboard", "at the origin and held in the frame"
-        if (off := np.abs(values).max()) > FILE_ROUNDING_SHARE * scale:
-            yield (
-                f"{name} of node {node.name} deviates by {off:.3g}; the {which} node must be "
-                f"{'parallel to the frame' if name == 'AP' else must}"
-            )
+    held = "the inboard node must be at the origin and held in the frame"
+    for name, scale, out_of_plane in (
+        ("origin", length, [2]),
+        ("phi", moved, [2]),
+        ("psi", moved / length, [0, 1]),
+    ):
+        yield from _off(f"{name} of node {first.name}", getattr(first, name).M0, scale, held)
+        if dimension == 2:
+            values = getattr(last, name).M0[out_of_plane]
+            flat = "the outboard node must be in the plane z = 0"
+            yield from _off(f"{name} of node {last.name}", values, scale, flat)
+    for node in (first, *tips):
+        parallel = "the node must be parallel to the frame"
+        yield from _off(f"AP of node {node.name}", node.AP.M0 - ONE, ONE, parallel)
 
 
 def _impossible(data: sid.StandardInputData, dimension: int) -> Iterator[str]:
@@ -409,22 +414,21 @@ def _impossible(data: sid.StandardInputData, dimension: int) -> Iterator[str]:
                 "and its coordinates be independent"
             )
     for name, values in (("ksigma", data.ksigma.M0), ("m1 of Ke", data.Ke.M1)):
-        if values.any():
-            yield (
-                f"{name} holds initial stresses or a stiffness that is not constant, which arms "
-                "do not have here; write the file without"
-            )
+        constant = (
+            "initial stresses or a stiffness that is not constant are nothing that arms have here; "
+            "write the file without"
+        )
+        yield from _off(name, values, 0.0, constant)
     if dimension == 3 and data.Oe.order == 0:
         yield (
             "Oe has no m1, by which deflections feel the rotation of the frame; write the file "
             "with matrices of order 1"
         )
-    least = 2.0 * FILE_ROUNDING_SHARE * np.abs(data.Me.M0).max()
-    if np.abs(coriolis + coriolis.swapaxes(0, 1)).max() > least:
-        yield (
-            "every third column of Ge must make a skew matrix: a block of three columns for each "
-            "coordinate, not one of all coordinates for each axis"
-        )
+    blocks = (
+        "every third column of Ge must make a skew matrix: a block of three columns for each "
+        "coordinate, not one of all coordinates for each axis"
+    )
+    yield from _off("Ge", coriolis + coriolis.swapaxes(0, 1), 2.0 * data.Me.M0, blocks)
     if dimension == 3:
         yield from _asymmetric({"Oe": data.Oe.M1.transpose(2, 0, 1)})
 
@@ -437,8 +441,7 @@ def _out_of_plane(data: sid.StandardInputData, inertia: np.ndarray) -> Iterator[
         ("column 3 of Ct", data.Ct.M0[:, 2], data.Ct.M0),
         ("columns 1, 2 of Cr", data.Cr.M0[:, :2], data.Cr.M0),
     ):
-        if (most := np.abs(values).max()) > FILE_ROUNDING_SHARE * np.abs(matrix).max():
-            yield f"{name} reach(es) {most:.3g}; an arm must move in the x-y plane only"
+        yield from _off(name, values, matrix, "an arm must move in the x-y plane only")
 
 
 def _half_stiffened(
@@ -473,10 +476,10 @@ def _half_stiffened(
 
 def _asymmetric(matrices: Mapping[str, np.ndarray]) -> Iterator[str]:
     """Yield what one load or rotation does to the coordinates (loads, q, q) without symmetry."""
+    symmetric = (
+        "must be symmetric in coordinates and rows or columns: it is what one load or rotation "
+        "does to the stiffness"
+    )
     # Relative to the largest under the same name: of a load that does nothing rounding is left.
     for name, loads in matrices.items():
-        if np.abs(loads - loads.swapaxes(1, 2)).max() > FILE_ROUNDING_SHARE * np.abs(loads).max():
-            yield (
-                f"m1 of {name} must be symmetric in coordinates and rows or columns: it is what "
-                "one load or rotation does to the stiffness"
-            )
+        yield from _off(f"m1 of {name}", loads - loads.swapaxes(1, 2), loads, symmetric)

@@ -137,7 +137,7 @@ def deviation_figure(trajectory: Trajectory, initial: np.ndarray | None = None) 
         trajectory: the motion.
         initial: (m, d) m, of the initial design, evenly over the same time, or None.
     """
-    t, limits = trajectory.t, deviation_limits(trajectory.scene)
+    t = trajectory.t
     lines = [_distance("", t, trajectory.distance)]
     if initial is not None and len(initial):
         even = np.linspace(t[0], t[-1], len(initial))
@@ -145,7 +145,7 @@ def deviation_figure(trajectory: Trajectory, initial: np.ndarray | None = None) 
         lines = [before, _distance(OPTIMISED, t, trajectory.distance)]
     # The only curve looks as that of the optimised design.
     styles = {line.label: look(len(lines) - 1 - k) for k, line in enumerate(lines)}
-    panel = _deviations(lines, limits)
+    panel = _deviations(lines, trajectory.scene)
     return panel_figure(deviation_title(trajectory), [[panel]], styles, 4.5, WIDE)
 
 
@@ -156,10 +156,10 @@ def _distance(name: str, t: np.ndarray, distance: np.ndarray) -> Line:
     return Line(": ".join(filter(None, (name, note))), t, MILLI * distance, worst)
 
 
-def _deviations(lines: Sequence[Line], limits: Sequence[Bound]) -> Panel:
-    """Return the panel of distances, mm, and of their limits, m."""
-    bounds = tuple((MILLI * limit, first, last) for limit, first, last in limits)
-    return Panel("", TIME, MILLIMETRES, tuple(lines), y_log=False, limits=bounds)
+def _deviations(lines: Sequence[Line], scene: Scene) -> Panel:
+    """Return the panel of distances, mm, and of the scene's limits of them."""
+    limits = tuple(deviation_limits(scene))
+    return Panel("", TIME, MILLIMETRES, tuple(lines), y_log=False, limits=limits)
 
 
 def check_figure(check: Check, scene: Scene) -> Figure:
@@ -178,7 +178,7 @@ def check_figure(check: Check, scene: Scene) -> Figure:
             less = Line(f"{name} less density", own.t, MILLI * (own.distance - base.distance))
             styles[less.label] = known[name]
             differences.append(less)
-    upper = _deviations(distances, deviation_limits(scene))
+    upper = _deviations(distances, scene)
     lower = Panel("", TIME, "difference [mm]", tuple(differences), y_log=False)
     return panel_figure(deviation_title(first), [[upper], [lower]], styles, width=WIDE)
 
@@ -205,9 +205,7 @@ def _drive_rows(trajectory: Trajectory) -> Iterator[list[Panel]]:
 
     def panel(label: str, unit: str, values: np.ndarray) -> Panel:
         shown, factor = SHOWN.get(unit, (unit, 1.0))
-        line = Line("", trajectory.t, factor * values)
-        note = f"largest {np.abs(line.y).max():.3g}"
-        return Panel(f"{label} [{shown}]", TIME, "", (line,), y_log=False, note=note)
+        return _over_time(f"{label} [{shown}]", Line("", trajectory.t, factor * values))
 
     scene, words = trajectory.scene, {"N": "force", "N m": "moment"}
     error, free = trajectory.q_r - trajectory.desired.q, free_drives(scene)
@@ -219,6 +217,12 @@ def _drive_rows(trajectory: Trajectory) -> Iterator[list[Panel]]:
     for name, sizes in trajectory.closure_sizes.items():
         if name not in scene.driven:  # a driven rod's is its drive's
             yield [panel(f"{name}: {words[unit]}", unit, size) for unit, size in sizes.items()]
+
+
+def _over_time(label: str, *lines: Line) -> Panel:
+    """Return curves over time under a label, with the largest value of the first one."""
+    note = f"largest {np.abs(lines[0].y).max():.3g}"
+    return Panel(label, TIME, "", lines, y_log=False, note=note)
 
 
 # -- the law of the motion -----------------------------------------------------------------------
@@ -235,9 +239,8 @@ def law_figure(scene: Scene) -> Figure:
     rows = []
     for k, word in enumerate(("way", "speed", "acceleration")):
         pairs = ("designed", length * designed[k]), (motion.law, length * plain[k])
-        lines = tuple(Line(name * (k == 0), t, values) for name, values in pairs)
-        note = f"largest {np.abs(lines[0].y).max():.3g}"
-        rows.append([Panel(f"{word} [{units[k]}]", TIME, "", lines, y_log=False, note=note)])
+        lines = (Line(name * (k == 0), t, values) for name, values in pairs)
+        rows.append([_over_time(f"{word} [{units[k]}]", *lines)])
     return panel_figure("Law along the path", rows, width=WIDE)
 
 
@@ -245,11 +248,11 @@ def law_figure(scene: Scene) -> Figure:
 
 
 def deviation_limits(scene: Scene) -> list[Bound]:
-    """Return the limits of the deviation, m, with first and last instant of each, s."""
+    """Return the limits of the deviation, mm, with first and last instant of each, s."""
     limits = []
     if (deviation := scene.constraints.limit("deviation")) is not None:
-        limits.append((deviation, scene.lead, scene.horizon))
+        limits.append((MILLI * deviation, scene.lead, scene.horizon))
     if (settling := scene.constraints.limit("settling")) is not None:
         lead = scene.lead
-        limits += [(settling, lead + begin, lead + end) for begin, end in rests(scene)]
+        limits += [(MILLI * settling, lead + begin, lead + end) for begin, end in rests(scene)]
     return limits

@@ -65,7 +65,7 @@ def design_figure(
     from dolfinopt.plots.solid import caption
 
     thickest = max((MILLI * float(v.wall.max()) for v in views if v.wall is not None), default=0.0)
-    marks = round_marks(0.0, thickest or 1.0, 5)
+    marks = round_marks(thickest)
     figure, rows = _panels(views, title, thickest > 0.0)
     for axes, view in zip(rows, views, strict=True):
         wall = None if view.wall is None else MILLI * view.wall
@@ -108,13 +108,17 @@ def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     figure, rows = _panels(views, title, True)
     stresses = [MEGA * view.stress for view in views if view.stress is not None]
     largest = max(float(stress.max()) for stress in stresses)
-    marks = round_marks(0.0, largest or 1.0, 5)
+    marks = round_marks(largest)
     for axes, view, stress in zip(rows, views, stresses, strict=True):
         _draw_arm(axes, view, stress, STRESS_COLOURS, marks[-1])
         worst, when = int(np.argmax(stress)), view.stress_instant
         assert when is not None
         if stress[worst] == largest > 0.0:
-            place = _flat(view, view.centroid[worst])
+            place = view.centroid[worst]
+            if is_solid(views):
+                from dolfinopt.plots.solid import LINKS
+
+                place = LINKS.plane(place)
             axes.plot(*place, "o", mfc="none", mec=BLUE, mew=1.8, ms=13.0, clip_on=False)
         places = zip("xyz", MILLI * view.centroid[worst])
         where = ", ".join(f"{name} = {value:.4g}" for name, value in places)
@@ -145,12 +149,11 @@ def parts_figure(
         from dolfinopt.plots.solid import surfaces_figure
 
         solids = [part for part in parts if isinstance(part, (SolidPart, HollowPart))]
-        notes = [
-            [f"volume {1e6 * part.volume:.4g} cm3", f"mass {mass:.4g} kg", *part.width_words]
-            for part, mass in zip(solids, masses, strict=True)
-        ]
-        names, surfaces = zip(*((part.name, part.surface) for part in solids), strict=True)
-        return surfaces_figure(names, surfaces, notes, title)
+        noted = []
+        for part, mass in zip(solids, masses, strict=True):
+            notes = [f"volume {1e6 * part.volume:.4g} cm3", f"mass {mass:.4g} kg"]
+            noted.append((part.name, part.surface, [*notes, *part.width_words]))
+        return surfaces_figure(noted, title)
     corners = [MILLI * part.domain.corners for part in plates]
     words = "part" if own else "part over density"
     foot = LABEL_FOOT if own else LABEL_FOOT + SCALE_FOOT
@@ -178,12 +181,13 @@ def figure_of_plates(parts: Sequence[PlanePart]) -> Figure:
     """Return a picture of parts as plates below each other, seen from the right and above."""
     from dolfinopt.plots.solid import Surface, surfaces_figure
 
-    surfaces, notes = [], []
+    noted = []
     for part in parts:
         corners = part.facets.reshape(-1, 3)
-        surfaces.append(Surface(corners, np.arange(len(corners)).reshape(-1, 3)))
-        notes.append([f"{len(part.shape.loops) - 1} holes", f"{len(part.shape.curves)} curves"])
-    return surfaces_figure([part.name for part in parts], surfaces, notes, "")
+        surface = Surface(corners, np.arange(len(corners)).reshape(-1, 3))
+        notes = [f"{len(part.shape.loops) - 1} holes", f"{len(part.shape.curves)} curves"]
+        noted.append((part.name, surface, notes))
+    return surfaces_figure(noted, "")
 
 
 def is_solid(views: Sequence[ArmView]) -> bool:
@@ -227,15 +231,6 @@ def _draw_arm(
     fill_cells(axes, view.corners, values, colours, largest)
     rim: Any = sides(view.corners)[boundary(view.corners)]
     axes.add_collection(LineCollection(rim, colors=GREY, linewidths=1.0), autolim=False)
-
-
-def _flat(view: ArmView, point: np.ndarray) -> np.ndarray:
-    """Return where a point of an arm (d,), m, is in its axes."""
-    if not is_solid([view]):
-        return point
-    from dolfinopt.plots.solid import LINKS
-
-    return LINKS.plane(point)
 
 
 def _arm_rows(

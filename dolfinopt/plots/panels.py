@@ -17,7 +17,6 @@ from dolfinopt.plots.style import (
     look,
     new_figure,
     shortened,
-    spans_decade,
     styled,
 )
 
@@ -72,12 +71,11 @@ def draw_panel(axes: Axes, panel: Panel, styles: Looks | None = None) -> None:
         axes.plot(line.x, line.y, label=line.label, markerfacecolor="none", **style)
     for limit, first, last in panel.limits:
         axes.hlines(limit, first, last, color=LIMIT, ls="--", lw=1.0)
-    values = [*(line.y for line in panel.lines), [limit for limit, *_ in panel.limits]]
-    y = np.concatenate([[], *values])
+    y = np.concatenate([*(line.y for line in panel.lines), [limit for limit, *_ in panel.limits]])
     y = y[np.isfinite(y)]
     x = np.concatenate([[], *(line.x for line in panel.lines)])
     low, high = (float(y.min()), float(y.max())) if len(y) else (0.0, 0.0)
-    steep = low > 0.0 and panel.y_log is not False and spans_decade(y)
+    steep = high > 10.0 * low > 0.0 and panel.y_log is not False
     if panel.log:
         axes.set(xscale="log", yscale="log")
     elif steep or (panel.y_log and low > 0.0):

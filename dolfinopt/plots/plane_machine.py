@@ -63,7 +63,6 @@ class PlaneStage:
             self._draw_closure(tie, point)
         if not self.stands:
             self.axes.axhline(poses.held[0, 0, 1], color=GREY, lw=THIN)
-        self.keep()
 
     def flat(self, points: np.ndarray) -> np.ndarray:
         """Return where points (..., 2), m, are in the axes."""

@@ -35,6 +35,7 @@ LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
 Colour = str | tuple[float, float, float]
 SIDES = 60  # of a round bar
+LINE = 2.0  # px
 EDGE = 35.0  # degrees between faces from which an edge stays sharp
 SHADED = {"smooth_shading": True, "split_sharp_edges": True, "feature_angle": EDGE, "ambient": 0.3,
           "diffuse": 0.85, "specular": 0.1}  # fmt: skip
@@ -105,11 +106,11 @@ class Studio:
                 look |= {"ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
             self.add(mesh, **look)
 
-    def line(self, points: np.ndarray, colour: Colour, width: float = 1.0) -> None:
-        """Draw line segments (n, 2, 3), m; `width` px."""
-        if len(points):
-            mesh = pyvista.line_segments_from_points(points.reshape(-1, 3))
-            self.plotter.add_mesh(mesh, color=colour, line_width=width, lighting=False, **PLAIN)
+    def line(self, points: np.ndarray, colour: Colour) -> None:
+        """Draw the line through points (n, 3), m; nothing of a single one."""
+        if len(points) > 1:
+            mesh = pyvista.lines_from_points(points)
+            self.plotter.add_mesh(mesh, color=colour, line_width=LINE, lighting=False, **PLAIN)
 
     def bar(self, ends: np.ndarray, radius: float, colour: Colour = BAR) -> None:
         """Draw a round bar between two points (2, 3), m; nothing where they coincide."""
@@ -170,13 +171,11 @@ def draw_length(axes: Axes, at: np.ndarray, length: float, above: float) -> None
     axes.text(at[0] + 0.5 * length, at[1] + above, f"{1e3 * length:.6g} mm", ha="center")
 
 
-def surfaces_figure(
-    names: Sequence[str], surfaces: Sequence[Surface], notes: Sequence[Sequence[str]], title: str
-) -> Figure:
+def surfaces_figure(parts: Sequence[tuple[str, Surface, Sequence[str]]], title: str) -> Figure:
     """Return the picture of parts below each other, to one scale, each under its size and notes."""
-    boxes = [(item.points.min(axis=0), item.points.max(axis=0)) for item in surfaces]
+    boxes = [(item.points.min(axis=0), item.points.max(axis=0)) for _, item, _ in parts]
     figure, panels = box_rows(boxes, title)
-    for name, surface, words, box, axes in zip(names, surfaces, notes, boxes, panels, strict=True):
+    for (name, surface, words), box, axes in zip(parts, boxes, panels, strict=True):
         _draw_boxed(axes, box, surface, edges=False, color=STEEL)
         axes.set_title(", ".join([_size_of(name, box), *words]))
     return figure
@@ -203,17 +202,11 @@ def _size_of(name: str, box: Box) -> str:
     return f"{name}:  {x:.4g} x {y:.4g} x {z:.4g} mm"
 
 
-def _seen(box: Box) -> Box:
-    """Return the lowest and highest place (2,) of a box in the camera's plane, m."""
-    seen = LINKS.plane(box_corners(*box))
-    return seen.min(axis=0), seen.max(axis=0)
-
-
 def box_rows(boxes: Sequence[Box], title: str, foot: float = 0.0) -> tuple[Figure, list[Axes]]:
     """Return a figure and axes for the boxes (lowest and highest corner (3,), m) of links."""
-    return stacked_axes(
-        [_seen(box) for box in boxes], title, above=0.4, below=0.5, foot=foot, least=0.3
-    )
+    seen = [LINKS.plane(box_corners(*box)) for box in boxes]
+    flat = [(places.min(axis=0), places.max(axis=0)) for places in seen]
+    return stacked_axes(flat, title, above=0.4, below=0.5, foot=foot, least=0.3)
 
 
 def draw_link(

@@ -65,7 +65,6 @@ class SolidStage:
         for place in poses.origin[0, [parent == GROUND for parent in poses.parents]]:
             self.studio.bar(np.stack([foot, place]), 2.0 * ROD * self.size)
         self.image = self.studio.show(self.studio.render())
-        self.keep()
 
     def _foot(self) -> np.ndarray:
         """Return where the machine stands (3,), m: as high as the world's origin, or lower."""
@@ -87,7 +86,7 @@ class SolidStage:
 
     def path(self, points: np.ndarray, colour: str) -> None:
         """Draw the line through points (n, 3), m."""
-        self.studio.line(np.stack([points[:-1], points[1:]], axis=1), colour, 2.0)
+        self.studio.line(points, colour)
 
     def pose(self, n: int, strength: float = 1.0) -> None:
         """Draw links, rigid bodies, joints and load at an instant."""

@@ -75,11 +75,6 @@ def shortened(name: str) -> str:
 # -- scales ----------------------------------------------------------------------------------
 
 
-def spans_decade(values: np.ndarray) -> bool:
-    """Return whether positive values differ by more than a factor of ten: drawn on a log scale."""
-    return bool(np.min(values) > 0.0 and np.max(values) > 10.0 * np.min(values))
-
-
 def log_scale(axes: Axes, values: np.ndarray) -> None:
     """Make y logarithmic for positive values, labelled with plain numbers."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
@@ -110,11 +105,11 @@ def round_number(value: float) -> float:
     return float(choices[np.argmin(np.abs(np.log(choices / value)))])
 
 
-def round_marks(low: float, high: float, count: int) -> np.ndarray:
-    """Return at most `count` + 1 round numbers, evenly spaced, from `low` or below to `high`."""
+def round_marks(largest: float) -> np.ndarray:
+    """Return at most six round numbers, evenly spaced, from 0 to the largest value or above."""
     from matplotlib.ticker import MaxNLocator
 
-    return np.asarray(MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(low, high))
+    return np.asarray(MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(0.0, largest or 1.0))
 
 
 def mixed(colour: str, strength: float) -> str:

@@ -38,7 +38,7 @@ from dolfinopt.optimization.result import RankResult
 from dolfinopt.optimization.state import HistoryRow
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import arms_with_design, read_history, under_law_of
-from dolfinopt.output.folders import working_alone
+from dolfinopt.output.folders import read_record, working_alone
 from dolfinopt.output.run_folder import optimize, simulated, write_result
 from dolfinopt.output.summary import figures, versions, write_summary
 from dolfinopt.parallel import on_root, together
@@ -70,9 +70,9 @@ class Case:
     scene: Scene  # complete; its name does not matter
     action: Action = "simulate"
     design: Case | Path | None = None  # given; of an optimising case, of a file, or the initial one
-    label: str = field(default="", compare=False)  # what progress and messages call it
+    label: str = ""  # what progress and messages call it
     samples: tuple[tuple[str, ...], ...] = ()  # what each changes, "key.path=value" each
-    first: int = field(default=0, compare=False)  # number of the first sample, for messages
+    first: int = 0  # number of the first sample, for messages
 
     @cached_property
     def key(self) -> str:
@@ -115,6 +115,7 @@ class Outcome:
     case: Case
     folder: Path  # of its files
     failure: str = ""  # message, "" where it succeeded
+    failures: Sequence[str] = ()  # what failed, a line each
     objective: float = math.nan
     compliance: float = math.nan
     max_deviation: float = math.nan
@@ -123,9 +124,8 @@ class Outcome:
     iterations: int = 0
     stop_reason: str = ""
     seconds: float = math.nan
+    samples: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of `SAMPLED`
     summary: Mapping[str, Any] = field(default_factory=dict)  # content of summary.json
-    samples: Mapping[str, np.ndarray] = field(default_factory=dict)  # (n,) of `SAMPLED`
-    messages: Mapping[int, str] = field(default_factory=dict)  # of samples that failed, by number
 
     def __str__(self) -> str:
         if self.failure:
@@ -138,17 +138,6 @@ class Outcome:
         elif self.case.action != "simulate":
             result = f"{len(self.case.samples)} samples"
         return f"{self.case.title}: {result}, {self.seconds:.1f} s"
-
-    @property
-    def failures(self) -> list[str]:
-        """What failed, a line each."""
-        if not self.messages:
-            return [f"{self.case.title}: {self.failure}"] if self.failure else []
-        case = self.case
-        names = {
-            k: f"{k} ({', '.join(sample)})" for k, sample in enumerate(case.samples, case.first)
-        }
-        return [f"{case.label}, sample {names[k]}: {text}" for k, text in self.messages.items()]
 
     @property
     def design(self) -> Path:
@@ -178,9 +167,9 @@ class Outcomes:
         return replace(self.by_case[case], case=case)
 
     @property
-    def failures(self) -> list[Outcome]:
-        """Those that failed."""
-        return [outcome for outcome in self.by_case.values() if outcome.failure]
+    def failures(self) -> tuple[str, ...]:
+        """What failed, a line each."""
+        return tuple(line for outcome in self.by_case.values() for line in outcome.failures)
 
 
 T = TypeVar("T")
@@ -310,11 +299,12 @@ def _trajectory(result: RankResult) -> Trajectory:
 
 
 CASES, WORK = "cases", ".work-"  # folders in DIR: of all cases; of a run, followed by its name
-SUMMARY, HISTORY, TRAJECTORY = "summary.json", "history.csv", "trajectory.npz"
+SUMMARY, TRAJECTORY = "summary.json", "trajectory.npz"
 DEVIATION = "deviation.npz"  # t and deviation of a simulation whose other files are not kept
 IDLE = 0.02  # s between two looks for a job
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
-FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason")
+FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason", "samples", "failure",
+           "failures")  # fmt: skip
 
 Job = Sequence[Case]  # of the same arms and design, which one rank builds once
 
@@ -347,25 +337,18 @@ class _Place:
         return True
 
     def fail(self, case: Case, message: str, **more: Any) -> None:
-        """Keep why a case failed, for this run."""
-        write_text(self._failure(case), json.dumps({"message": message, **more}))
+        """Keep why a case failed, for this run: in a few words, and a line for all that failed."""
+        known = {"failure": message, "failures": [f"{case.title}: {message}"]}
+        write_text(self._failure(case), json.dumps(known | more))
 
     def read(self, case: Case) -> Outcome:
         """Read a case back."""
         failed = self._failure(case)
         path = failed if failed.exists() else self[case] / SUMMARY
         data = json.loads(path.read_text("utf-8"))
-        samples, messages = data.get("samples", {}), data.get("messages", {})
-        return Outcome(
-            case,
-            self[case],
-            data.get("message", ""),
-            **{name: data[name] for name in FIGURES if name in data},
-            seconds=data.get("seconds", {}).get("total", math.nan),
-            summary={} if path == failed else data,
-            samples={name: np.array(values, float) for name, values in samples.items()},
-            messages={int(k): text for k, text in messages.items()},
-        )
+        known = {name: data[name] for name in FIGURES if name in data}
+        known["seconds"] = data.get("seconds", {}).get("total", math.nan)
+        return Outcome(case, self[case], **known, summary=data)
 
     def check(self) -> None:
         """Tell of cases that have ended; raise OthersFailed if another rank has failed."""
@@ -417,24 +400,16 @@ def _begin(place: _Place, wanted: Sequence[Case]) -> list[bool]:
         shutil.rmtree(left, ignore_errors=True)
     make_folder(place.cases)
     make_folder(place.work)
-    done = [_is_complete(place[case], place.keep or case.action != "simulate") for case in wanted]
-    for case, there in zip(wanted, done, strict=True):
-        if not there and case.action == "optimize":
-            (place[case] / SUMMARY).unlink(missing_ok=True)  # its checkpoint stays
-        elif not there:
-            shutil.rmtree(place[case], ignore_errors=True)
+    done = []
+    for case in wanted:
+        folder = place[case]
+        brief = place.keep and (folder / DEVIATION).exists()
+        done.append(not brief and "seconds" in read_record(folder / SUMMARY))
+        if not done[-1] and case.action == "optimize":
+            (folder / SUMMARY).unlink(missing_ok=True)  # its checkpoint stays
+        elif not done[-1]:
+            shutil.rmtree(folder, ignore_errors=True)
     return done
-
-
-def _is_complete(folder: Path, keep: bool) -> bool:
-    """Tell whether a case is done, with all its files where they are to be kept."""
-    if keep and (folder / DEVIATION).exists():
-        return False
-    try:
-        json.loads((folder / SUMMARY).read_text("utf-8"))["seconds"]["total"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return True
 
 
 # -- who does what ---------------------------------------------------------------------------
@@ -497,20 +472,19 @@ def _do(job: Job, place: _Place) -> None:
 def _optimise(case: Case, place: _Place) -> None:
     """Optimise, from the checkpoint of an interrupted run if there is one."""
     begun, folder, scene = time.perf_counter(), place[case], _unnamed(case)
-    resume, earlier = True, 0.0
+    resume = True
     try:
         checkpoint.check(folder, scene)
     except InputError:  # none, damaged, or made when a file of the scene was elsewhere
         resume = False
-    if resume and (folder / HISTORY).exists() and (rows := read_history(folder / HISTORY)):
-        earlier = rows[-1].seconds
     how: dict[str, Any] = {"resume": resume, "overwrite": not resume, "world": MPI.COMM_SELF}
     try:
         result = optimize(scene, folder, **how, report=lambda row: place.check())
     except ConvergenceError as error:
         place.fail(case, str(error))
         return
-    write_result(folder, result, earlier + time.perf_counter() - begun, paraview=False)
+    wall = max(time.perf_counter() - begun, result.rows[-1].seconds)  # before a resume, too
+    write_result(folder, result, wall, paraview=False)
 
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:
@@ -548,19 +522,20 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
         scaled = scales_bodies(scene, keys)
         if scaled and nominal is None:
             (nominal,) = simulate_scenarios([scene], design)
-        rows, messages = [], {}
+        rows, failures = [], []
         result = simulate_samples(nominal if scaled else None, scenes, design)
         for number, trajectory in enumerate(result, case.first):
             if isinstance(trajectory, ConvergenceError):
-                messages[number] = str(trajectory)
+                sample = f"{number} ({', '.join(case.samples[number - case.first])})"
+                failures.append(f"{case.label}, sample {sample}: {trajectory}")
                 rows.append((math.nan,) * len(SAMPLED))
             else:
                 worst = worst_instants(trajectory, trajectory.scene.objective.load_cases)
                 compliance = float(trajectory.compliance[worst].sum())
                 rows.append((compliance, *trajectory.max_deviation))
         samples = dict(zip(SAMPLED, np.transpose(rows).tolist(), strict=True))
-        if messages:
-            place.fail(case, f"{len(messages)} samples", samples=samples, messages=messages)
+        if failures:
+            place.fail(case, f"{len(failures)} samples", samples=samples, failures=failures)
         else:
             folder, wall = place[case], time.perf_counter() - begun
             make_folder(folder)

@@ -17,18 +17,10 @@ from dolfinopt.study import tables
 from dolfinopt.study.tables import FrameFigure, LineFigure
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
-
-
-def draw_study(study: tables.Study, folder: Path) -> list[Path]:
-    """Draw every figure of a study as FOLDER/<study>[_<figure>].png; return the paths."""
-    return draw_all(
-        {tables.joined(study.name, figure.name): figure for figure in study.figures}, folder
-    )
 
 
 def draw_all(figures: Mapping[str, tables.Figure], folder: Path) -> list[Path]:
@@ -71,13 +63,6 @@ def _grid(
     return drawn, drawn.subplots(rows, columns, squeeze=False)
 
 
-def _label(axes: Axes, title: str = "", x_label: str = "", y_label: str = "") -> None:
-    """Write what axes show."""
-    axes.set_title(title)
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
-
-
 # -- tables and samples ------------------------------------------------------------------------
 
 
@@ -100,7 +85,8 @@ def matrix_figure(figure: FrameFigure) -> Figure:
                       fontsize=9 if count <= CROWD else 7)  # fmt: skip
         axes.set_xticks(range(count), part[made_for])
         axes.set_yticks(range(count), part[made_for])
-        _label(axes, title, made_for.replace("made for", "used at", 1), made_for)
+        used_at = made_for.replace("made for", "used at", 1)
+        axes.set(title=title, xlabel=used_at, ylabel=made_for)
         drawn.colorbar(image, ax=axes, shrink=0.8, extend="both")
     return drawn
 
@@ -122,7 +108,7 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
             values = own.loc[own["sample"] > 0, what].to_numpy()
             axes.hist(values, bins="fd", color=styles[design]["color"], alpha=0.55)
             axes.axvline(own[what].iloc[0], color="black", linestyle="--", linewidth=1.2)
-            _label(axes, design, what, "samples [-]")
+            axes.set(title=design, xlabel=what, ylabel="samples [-]")
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             share = axes.twinx()
             share.ecdf(values, color=GREY)

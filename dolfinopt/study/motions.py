@@ -72,8 +72,7 @@ def study_motions(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps[
         searched = [design, Case(forward, "optimize", label=DESIGNED)]
         result = yield searched
         if result.failures:
-            failed = tuple(text for failure in result.failures for text in failure.failures)
-            return Study(NAME, (), (), failed)
+            return Study(NAME, (), (), result.failures)
         files = [result[item].design for item in searched]
     rows = _motions(scene, files, folder / NAME)
     return (yield from reported(NAME, rows, partial(report, scene=scene)))
@@ -171,7 +170,7 @@ def report(frame: pd.DataFrame, scene: Scene) -> Report:
         "finer model [mm]",
         "settling [mm]",
     ]
-    further = pd.DataFrame([_further(scene, outcome.summary) for outcome in frame["outcome"]])
+    further = pd.DataFrame(_further(scene, outcome.summary) for outcome in frame["outcome"])
     table = Table(
         "", f"{_verdict(able)} {NOTE}", with_failures(frame, frame[columns].join(further))
     )

@@ -249,10 +249,9 @@ def _balanced(
     The latter are of `stepped`, with one arm's share changed each; `move` is the largest change of
     a share's logarithm.
     """
-    names = [name for name in base if all(name in excesses for excesses in changed)]
-    values, start, steps = np.array([base[name] for name in names]), np.log(shares), np.log(stepped)
-    after = np.array([[excesses[name] for name in names] for excesses in changed])
-    slopes = (after - values) / np.diag(steps - start)[:, None]  # (arms, limits)
+    known = pd.DataFrame([base, *changed]).dropna(axis="columns").to_numpy(dtype=float)
+    values, start, steps = known[0], np.log(shares), np.log(stepped)
+    slopes = (known[1:] - values) / np.diag(steps - start)[:, None]  # (arms, limits)
     exponent = slopes.sum(axis=0) + 1e-9
 
     def room(z: np.ndarray) -> np.ndarray:

@@ -135,8 +135,7 @@ def reported(name: str, rows: Rows, report: Callable[[pd.DataFrame], Report]) ->
     tables, figures = report(
         pd.DataFrame({**labels, **results_of(outcomes[case])} for labels, case in rows)
     )
-    failures = tuple(line for outcome in outcomes.failures for line in outcome.failures)
-    return Study(name, tuple(tables), tuple(figures), failures)
+    return Study(name, tuple(tables), tuple(figures), outcomes.failures)
 
 
 def results_of(outcome: Outcome) -> dict[str, Any]:
@@ -311,10 +310,10 @@ def _sweep(
     points = []  # labels, scene and columns of each
     for j, values in enumerate(product(*(vary.values for vary in keys))):
         settings = list(zip(keys, values, strict=True))
-        label = ", ".join(f"{vary.key} = {float(value):g}" for vary, value in settings)
+        label = ", ".join(f"{vary.key} = {value:g}" for vary, value in settings)
         with asked_by(" ".join(f"--vary {vary.text}" for vary in keys)):
-            there = changed(scene, *(f"{vary.key}={value}" for vary, value in settings))
-        columns = {vary.axis: float(value) for vary, value in settings}
+            there = changed(scene, *(vary.setting(value) for vary, value in settings))
+        columns = {vary.axis: value for vary, value in settings}
         points.append((label, there, {"swept": swept, "point": j} | columns))
 
     def rows(role: str, name: str, designs: Sequence[Design], made_for: int = -1) -> Rows:
@@ -414,7 +413,7 @@ def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
         bars = []
         for vary in keys:
             change = 100.0 * (shown.get_group((design, vary.key))[what] / bases[what][design] - 1.0)
-            ends = f"{vary.axis}: {vary.numbers[0]:g} ... {vary.numbers[-1]:g}"
+            ends = f"{vary.axis}: {vary.values[0]:g} ... {vary.values[-1]:g}"
             bars.append((ends, float(change.iloc[0]), float(change.iloc[-1])))
         bars.sort(key=lambda bar: -max(abs(bar[1]), abs(bar[2])))
         rows += [(design, what.partition(" [")[0], *bar) for bar in bars]

@@ -111,6 +111,11 @@ class Study:
     figures: tuple[Figure, ...]
     failures: tuple[str, ...] = ()  # one line each
 
+    @property
+    def files(self) -> dict[str, Figure]:
+        """The figures by their files' names, <study>[_<figure>]."""
+        return {joined(self.name, figure.name): figure for figure in self.figures}
+
     def markdown(self) -> str:
         """Return all tables but the long ones."""
         return "\n".join(table.markdown() for table in self.tables if not table.long)
@@ -119,9 +124,9 @@ class Study:
 def write_study(study: Study, folder: Path) -> list[Path]:
     """Write all tables as CSV and Markdown, and the curves as CSV (root only); return the paths."""
     texts = {f"{joined(study.name, table.name)}.csv": table.csv() for table in study.tables}
-    for figure in study.figures:
+    for name, figure in study.files.items():
         if isinstance(figure, LineFigure):
-            texts[f"{joined(study.name, figure.name)}_curves.csv"] = figure.csv()
+            texts[f"{name}_curves.csv"] = figure.csv()
     texts[f"{study.name}.md"] = study.markdown()
     for name, text in texts.items():
         write_text(folder / name, text)

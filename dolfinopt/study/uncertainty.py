@@ -254,7 +254,7 @@ def polynomial_indices(
         fits.append((degree, powers, *_fit(basis, spread)))
     degree, powers, coefficients, without, missed = min(fits, key=lambda fit: fit[-1])
     shares, leaving = _shares(powers, coefficients[None])[0], _shares(powers, without)
-    result = [_jackknife(share, others) for share, others in zip(shares, leaving.T)]
+    result = _jackknife(shares, leaving)
     return Indices(result[:dimensions], result[dimensions:], degree, missed)
 
 
@@ -282,12 +282,12 @@ def _shares(powers: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     return np.concatenate([squares @ alone, squares @ involved], axis=1) / variance
 
 
-def _jackknife(value: float, leaving: np.ndarray) -> Estimate:
-    """Return an index within [0, 1] with an interval from those (n,) that leave a sample out."""
+def _jackknife(indices: np.ndarray, leaving: np.ndarray) -> list[Estimate]:
+    """Return indices (m,) in [0, 1] with intervals from those (n, m) that leave a sample out."""
     # Source: Efron & Tibshirani (1993), 11.2, doi:10.1201/9780429246593.
-    n = len(leaving)
-    half = WIDE * math.sqrt((n - 1) / n * float(np.sum((leaving - leaving.mean()) ** 2)))
-    return Estimate(float(value), max(float(value) - half, 0.0), min(float(value) + half, 1.0))
+    half = WIDE * math.sqrt(len(leaving) - 1) * leaving.std(axis=0)
+    ends = np.maximum(indices - half, 0.0), np.minimum(indices + half, 1.0)
+    return [Estimate(*row) for row in np.stack([indices, *ends], axis=1).tolist()]
 
 
 # -- uncertainties of a scene --------------------------------------------------------------------
@@ -309,18 +309,13 @@ class Input:
     """A scene value, what the scene says of it, and its distribution within the key's range."""
 
     key: str
-    nominal: object
+    nominal: float  # nan where arms differ in it
     distribution: Distribution
 
     @property
     def axis(self) -> str:
         """Key with its unit."""
         return axis_of(self.key)
-
-    @property
-    def number(self) -> float:
-        """The nominal value, nan where arms differ in it."""
-        return self.nominal if isinstance(self.nominal, float) else math.nan
 
 
 def study_random(
@@ -397,7 +392,7 @@ def parse_input(scene: Scene, text: str) -> Input:
     with asked_by(f"--random {text}"):
         distribution, parts = parse_distribution(law), in_new_words(key).split(".")
         there = changed(scene, f"{key}={float(distribution.at(np.array(0.5)))!r}")
-        if not isinstance(nominal_value(there, key), float):
+        if math.isnan(nominal_value(there, key)):
             raise InputError("expected a key with a real number as its value")
         if parts[0] not in TABLES:
             raise InputError(
@@ -415,22 +410,20 @@ def parse_input(scene: Scene, text: str) -> Input:
             raise InputError(f"{error}; {'.'.join(parts)} is {words}") from None
 
 
-def nominal_value(scene: Scene, key: str) -> object:
-    """Return the scene's value of a key, None where arms differ in it."""
+def nominal_value(scene: Scene, key: str) -> float:
+    """Return the scene's value of a key, nan where arms differ in it or it is no real number."""
     table, *which, name = in_new_words(key).split(".")
     if name.endswith("*"):
         return 1.0
-    rows = getattr(scene, table)
-    if not isinstance(rows, tuple):
-        return getattr(rows, name, None)
-    values = set()
-    for i, row in enumerate(rows):
+    rows, values = getattr(scene, table), set()
+    for i, row in enumerate(rows if isinstance(rows, tuple) else (rows,)):
         own = getattr(row, name, None)
         if own is None and table == "arms":
             own = getattr(scene.material_of(i), name, None)
-        if not which or which[0] in (str(i), row.name):
+        if not which or which[0] in (str(i), getattr(row, "name", "")):
             values.add(own)
-    return values.pop() if len(values) == 1 else None
+    value = values.pop() if len(values) == 1 else None
+    return value if isinstance(value, float) else math.nan
 
 
 def _range(table: str, name: str) -> tuple[float, float]:
@@ -449,7 +442,7 @@ def _range(table: str, name: str) -> tuple[float, float]:
 def _report(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -> Report:
     """Return tables and figures of the samples' values (n, d), and a table of all samples."""
     tables = [_input_table(inputs)]
-    if any(o.failure and not o.messages for o in frame["outcome"]):  # a design is missing
+    if any(o.failure and not o.samples for o in frame["outcome"]):  # a design is missing
         return tables, []
     samples, axes = _samples(frame, inputs, values), [item.axis for item in inputs]
     figures: list[Figure] = []
@@ -466,7 +459,7 @@ def _report(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) ->
 
 def _samples(frame: pd.DataFrame, inputs: Sequence[Input], values: np.ndarray) -> pd.DataFrame:
     """Return a row a design and sample, number 0 with the nominal values: inputs and results."""
-    rows = np.vstack([[item.number for item in inputs], values])
+    rows = np.vstack([[item.nominal for item in inputs], values])
     known = pd.DataFrame(rows, columns=[item.axis for item in inputs])
     known.insert(0, "sample", np.arange(len(known)))
     parts = []
@@ -483,7 +476,7 @@ def _input_table(inputs: Sequence[Input]) -> Table:
     for item in inputs:
         law = item.distribution
         cut = round(100.0 * law.cut_off, 6)
-        rows.append((item.axis, law.text, item.number, law.mean, law.deviation, cut))
+        rows.append((item.axis, law.text, item.nominal, law.mean, law.deviation, cut))
     columns = "input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]"
     title = "Random values, independent of one another, cut off where the key's range ends."
     return Table("inputs", title, pd.DataFrame(rows, columns=columns))

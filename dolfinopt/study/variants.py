@@ -36,24 +36,23 @@ MOST = {"balanced": 12}
 
 @dataclass(frozen=True)
 class Vary:
-    """One scene value by its path, what it takes as --set would, and the text that asks for it."""
+    """One scene value by its path, the numbers it takes, and the text that asks for it."""
 
     key: str
-    values: tuple[str, ...]
+    values: tuple[float, ...]
     text: str
 
-    @property
-    def numbers(self) -> list[float]:
-        """The values, as numbers."""
-        return [float(value) for value in self.values]
+    def setting(self, value: float) -> str:
+        """Return "key=value" of one of them; whole numbers as such: a key may be an integer."""
+        return f"{self.key}={value!r}".removesuffix(".0")
 
     @property
     def whole_numbers(self) -> list[int]:
-        """The values, each once, as whole numbers; InputError where one is none."""
-        for value, number in zip(self.values, self.numbers, strict=True):
-            if number % 1.0:
-                raise InputError(f"--vary {self.text}: expected whole numbers, found {value}")
-        return list(dict.fromkeys(map(int, self.numbers)))
+        """The values as whole numbers; InputError where one is none."""
+        for value in self.values:
+            if value % 1.0:
+                raise InputError(f"--vary {self.text}: expected whole numbers, found {value:g}")
+        return list(map(int, self.values))
 
     @property
     def axis(self) -> str:
@@ -71,9 +70,9 @@ def axis_of(key: str) -> str:
 
 def parse_vary(text: str) -> Vary:
     """Return what "key.path=start:stop:count" or "key.path=a,b,c" asks for, else InputError."""
-    key, _, values = (part.strip() for part in text.partition("="))
+    key, _, values = text.partition("=")
     is_range = ":" in values
-    parts = [part.strip() for part in values.split(":" if is_range else ",")]
+    parts = values.split(":" if is_range else ",")
     try:
         numbers = list(map(float, parts))
         if is_range:
@@ -81,18 +80,16 @@ def parse_vary(text: str) -> Vary:
             count = int(parts[2])
     except ValueError:
         numbers = [math.nan]
-    if not key or not np.isfinite(numbers).all():
+    if not key.strip() or not np.isfinite(numbers).all():
         raise InputError(
             f"--vary {text}: expected key.path=start:stop:count or key.path=a,b,c with numbers, "
             "for example payload.mass=4:8:9"
         )
-    if not is_range:
-        return Vary(key, tuple(dict.fromkeys(parts)), text)
-    if count < 2 or start == stop:
-        raise InputError(f"--vary {text}: expected at least two values between two ends")
-    steps = np.linspace(start, stop, count)
-    # Whole numbers are written as such: a key may be an integer.
-    return Vary(key, tuple(repr(float(step)).removesuffix(".0") for step in steps), text)
+    if is_range:
+        if count < 2 or start == stop:
+            raise InputError(f"--vary {text}: expected at least two values between two ends")
+        numbers = np.linspace(start, stop, count).tolist()
+    return Vary(key.strip(), tuple(dict.fromkeys(numbers)), text)
 
 
 def changed(scene: Scene, *overrides: str) -> Scene:
@@ -202,7 +199,7 @@ def reductions(scene: Scene, counts: Sequence[int] | None, usual: Sequence[int])
         if count not in possible:
             raise refusals[count]
     if not scenes:
-        raise InputError(f"{scene.source}: no reduction is possible with these arms")
+        raise refusals[usual[0]]
     return scenes
 
 

@@ -236,12 +236,12 @@ REFUSED = {
     "without forces": (
         lambda d: swap(swap(d, "Oe", "M1", r113=0.2), "Ct", "M1", r111=0.2), (2, 3),
         "m1 of Ct holds geometric stiffening", "m1 of phi of node 2 lacks"),
-    "rotation": (lambda d: swap(d, "Oe", "M1", r124=9.0), (3,), "m1 of Oe must be symmetric"),
+    "rotation": (lambda d: swap(d, "Oe", "M1", r124=9.0), (3,), "m1 of Oe", "symmetric"),
     "push": (lambda d: swap(sid_of(stiffened(from_sid(d, 2), 1)), "Ct", "M1", r121=9.0), (2,),
-             "m1 of Ct must be symmetric"),
+             "m1 of Ct", "symmetric"),
     "outboard load": (
         lambda d: node(swap(d, "Ct", "M1", r113=1.0), 1, "phi", "M1", r112=1.0), (3,),
-        "m1 of phi, psi of node 2 must be symmetric"),
+        "m1 of phi, psi of node 2", "symmetric"),
     "no order": (lambda d: replace(d, Oe=replace(d.Oe, order=0)), (3,),
                  "Oe has no m1", "matrices of order 1"),
     "Ge": (lambda d: swap(d, "Ge", r13=0.2), (2, 3), "Ge", "skew"),

@@ -167,7 +167,7 @@ def test_the_vibration_between_two_strokes_counts(tmp_path):
     assert limits["settling"].value == both.settling
     _, alone = moved(strokes(tmp_path, FIRST, "motion.horizon=0.6"))
     assert both.settling == pytest.approx(alone.settling, rel=1e-3)
-    assert deviation_limits(both.scene) == [(1e-3, 0.3, 0.6), (1e-3, 1.6, 2.0)]
+    assert deviation_limits(both.scene) == [(1.0, 0.3, 0.6), (1.0, 1.6, 2.0)]
     without = strokes(tmp_path, BOTH, "motion.dwells=false")
     assert rests(without) == ((1.6, 2.0),)
     assert moved(without)[1].settling == pytest.approx(last, rel=1e-6)

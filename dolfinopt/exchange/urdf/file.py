@@ -357,34 +357,29 @@ def mesh_path(file: Path, name: str) -> Path | None:
     Last, ROBOT left out, beside the file and in the folders above it.
     """
     scheme, colon, rest = name.partition("://")
+    above = _folders_above(file)
     if not colon or scheme == "file":
-        path = Path(rest if colon else name)
-        places = [path] if path.is_absolute() else [above / path for above in _folders_above(file)]
+        places = [folder / (rest or name) for folder in above]  # of an absolute path itself
     else:
         package, _, inner = rest.lstrip("/").partition("/")
-        places = [root / inner for root in _packages(file, package)]
-        places += [folder / inner for folder in _folders_above(file)]
+        places = [folder / package / inner for folder in [*_workspaces(), *above]]
+        places += [folder / inner for folder in above]
     return next((place for place in places if place.is_file()), None)
 
 
-def _packages(file: Path, package: str) -> Iterator[Path]:
-    """Yield the folders that may be a ROS package."""
+def _workspaces() -> Iterator[Path]:
+    """Yield the folders in which ROS looks for packages."""
 
     def stated(variable: str) -> list[Path]:
         return [Path(place) for place in os.environ.get(variable, "").split(os.pathsep) if place]
 
     for folder in stated("ROS_PACKAGE_PATH"):
-        if folder.absolute().name == package:
-            yield folder
-        yield folder / package
-        yield from sorted(place / package for place in folder.glob("*/"))  # a workspace of stacks
-        yield folder / "share" / package
+        yield folder.absolute().parent  # it may be a package itself
+        yield folder
+        yield from sorted(folder.glob("*/"))  # a workspace of stacks
+        yield folder / "share"
     for folder in stated("AMENT_PREFIX_PATH"):
-        yield folder / "share" / package
-    for folder in _folders_above(file):
-        if folder.name == package:
-            yield folder
-        yield folder / package
+        yield folder / "share"
 
 
 def _folders_above(file: Path) -> list[Path]:

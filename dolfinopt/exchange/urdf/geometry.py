@@ -157,7 +157,8 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
     ends = _ends(piece, body.length)
     if ends is not None and (cut := _between(piece, ends)):
         piece, share = cut[0], share * cut[1]
-        notes += _shortened(ends, body.length)
+        gaps = {"inboard": ends[0], "outboard": body.length - ends[1]}
+        notes += [f"ends {x:.3g} m before the {name} joint" for name, x in gaps.items() if x > 0.0]
     else:
         notes.append("not cut at the joints: rigid where it is nearest to them")
         ends = None
@@ -345,12 +346,6 @@ def _between(link: Trimesh, ends: np.ndarray) -> tuple[Trimesh, float] | None:
     body, share = _largest(cut)
     leads = np.allclose(body.bounds[:, 0], ends, atol=1e-3 * np.ptp(ends))
     return (body, share) if leads and share >= WHOLE else None
-
-
-def _shortened(ends: np.ndarray, length: float) -> list[str]:
-    """Return a sentence for every end at which the geometry does not reach its joint."""
-    gaps = (("inboard", ends[0]), ("outboard", length - ends[1]))
-    return [f"ends {gap:.3g} m before the {name} joint" for name, gap in gaps if gap > 0.0]
 
 
 # -- cells -----------------------------------------------------------------------------------

@@ -112,13 +112,10 @@ class Inertia:
 
     def __add__(self, other: Inertia) -> Inertia:
         """Return that of both bodies held together, in the same components."""
-        mass, centre, tensor = self.mass + other.mass, self.centre, np.zeros((3, 3))
-        if mass != 0.0:
-            centre = (self.mass * self.centre + other.mass * other.centre) / mass
-        for item in (self, other):
-            r = item.centre - centre
-            tensor += item.tensor + item.mass * (r @ r * np.eye(3) - np.outer(r, r))
-        return Inertia(mass, centre, tensor)
+        mass, r = self.mass + other.mass, other.centre - self.centre
+        share = other.mass / (mass or 1.0)
+        parallel = share * self.mass * (r @ r * np.eye(3) - np.outer(r, r))
+        return Inertia(mass, self.centre + share * r, self.tensor + other.tensor + parallel)
 
 
 MASSLESS = Inertia(0.0, np.zeros(3), np.zeros((3, 3)))

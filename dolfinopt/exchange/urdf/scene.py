@@ -171,12 +171,14 @@ class RobotScene:
         new: dict[str, str | bytes] = {
             self.mesh_name(item): msh_bytes(item.mesh) for item in self.bodies if item.mesh
         }
-        columns = [*(joint.name for joint in self.robot.movable), *self.loops.rods]
-        kept = [k for k, name in enumerate(columns) if name not in self.loops.passive]
-        names = [self.joints.get(columns[k], columns[k]) for k in kept]
-        lines = [",".join(["t", *names])]
-        table = np.column_stack([t, rows[:, kept]])
-        lines += [",".join(map(repr, map(float, row))) for row in table]
+        names = [*(joint.name for joint in self.robot.movable), *self.loops.rods]
+        columns = {
+            self.joints.get(name, name): values.tolist()
+            for name, values in zip(names, rows.T, strict=True)
+            if name not in self.loops.passive
+        }
+        lines = [",".join(["t", *columns])]
+        lines += [",".join(map(repr, row)) for row in zip(t.tolist(), *columns.values())]
         new[TRAJECTORY] = "\n".join(lines) + "\n"
         # What `export RUN robot` needs: the file, and every solid's link and frame.
         urdf = Path(os.path.relpath(self.robot.file.absolute(), folder.absolute())).as_posix()
@@ -251,17 +253,17 @@ class _Extent:
 
 def _extent(body: SceneBody) -> _Extent:
     assert body.size is not None
-    if body.mesh is not None:
-        mesh, passive = body.mesh, min(body.mesh.side, PASSIVE * body.length)
+    if (mesh := body.mesh) is not None:
+        sides, cell, layer, volume = body.size, mesh.side, mesh.side, mesh.volume
         ends = mesh.ends_within(mesh.side)
-        return _Extent(body.size, mesh.side, float(f"{passive:.6g}"), mesh.volume, ends)
-    height, thickness = (_up(item) for item in body.size)
-    cells = cells_of(body.length, height, thickness)
-    along, *across = (x / n for x, n in zip((body.length, height, thickness), cells, strict=True))
-    volume = body.length * height * thickness
-    passive = min(along, PASSIVE * body.length)
-    ends = 2.0 * volume / cells[0]
-    return _Extent((height, thickness), max(along, *across), float(f"{passive:.6g}"), volume, ends)
+    else:
+        sides = height, thickness = _up(body.size[0]), _up(body.size[1])
+        lengths, cells = (body.length, *sides), cells_of(body.length, *sides)
+        layer, *across = (x / n for x, n in zip(lengths, cells, strict=True))
+        cell, volume = max(layer, *across), body.length * height * thickness
+        ends = 2.0 * volume / cells[0]
+    passive = float(f"{min(layer, PASSIVE * body.length):.6g}")
+    return _Extent(sides, cell, passive, volume, ends)
 
 
 def _up(value: float) -> float:
@@ -304,53 +306,52 @@ def read_trajectory(
     Raises:
         InputError: the robot cannot follow it.
     """
-    every = column_names(file)
-    names = _columns_of(robot, file, [name for name in every if name not in loops.rods])
-    if missing := [name for name in loops.rods if name not in every]:
-        raise InputError(f"{file}: no column {missing[0]}, the length of this driven rod in m")
-    table = read_table(file, (*names, *loops.rods))
+    names = _columns_of(robot, file, loops.rods)
+    table = read_table(file, names)
     assert table.t is not None
-    joints, lengths = np.split(table.rows, [len(names)], axis=1)
-    rows, held = _complete(robot, names, joints, loops.passive)
+    given = dict(zip(names, table.rows.T, strict=True))
+    rows, held = _complete(robot, len(table.t), given, loops.passive)
     _check_positions(robot, file, table.lines, rows)
     curve = curve_in_time(Table(file, table.lines, table.t, rows))
     rates = curve(np.linspace(0.0, curve.end, 2000))[1]
-    return table.t, np.hstack([rows, lengths]), [*held, *_too_fast(robot, file, rates)]
+    every = np.column_stack([rows, *(given[name] for name in loops.rods)])
+    return table.t, every, [*held, *_too_fast(robot, file, rates)]
 
 
-def _columns_of(robot: Robot, file: str, names: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of a table's columns but t, all joints with a coordinate of their own."""
-    joints = [joint.name for joint in robot.joints]
+def _columns_of(robot: Robot, file: str, rods: Sequence[str]) -> tuple[str, ...]:
+    """Return a table's columns but t: joints with a coordinate of their own, all driven rods."""
+    names, joints = column_names(file), [joint.name for joint in robot.joints]
     own = [joint.name for joint in robot.movable if joint.mimic is None]
     allowed = f"expected t and any of {', '.join(own)}"
     if "t" not in names:
         raise InputError(f"{file}: no column t, the instants in s; {allowed}")
     result = tuple(name for name in names if name != "t")
-    if wrong := [name for name in result if name not in own]:
+    if wrong := [name for name in result if name not in (*own, *rods)]:
         what = "this joint is fixed, or follows another" if wrong[0] in joints else "no such joint"
         raise InputError(f"{file}: column {wrong[0]!r}: {what}; {allowed}")
+    if missing := [name for name in rods if name not in names]:
+        raise InputError(f"{file}: no column {missing[0]}, the length of this driven rod in m")
     return result
 
 
 def _complete(
-    robot: Robot, names: Sequence[str], rows: np.ndarray, passive: frozenset[str]
+    robot: Robot, count: int, given: Mapping[str, np.ndarray], passive: frozenset[str]
 ) -> tuple[np.ndarray, list[str]]:
     """Return values (n, joints) of all joints that move, and a sentence on those not given."""
     # Such a joint stands at zero, or at the limit nearest to it; one that follows another does so.
-    given = dict(zip(names, np.asarray(rows, dtype=float).T, strict=True))
-    held = []
+    values, held = dict(given), []
     for joint in robot.movable:
         if joint.mimic is None and joint.name not in given:
             value = min(max(0.0, joint.lower), joint.upper)
-            given[joint.name] = np.full(len(rows), value)
+            values[joint.name] = np.full(count, value)
             if joint.name not in passive:
                 held.append(f"{joint.name} = {value:g}")
     for joint in robot.movable:
         if joint.mimic is not None:
-            followed = given[joint.mimic.joint]
-            given[joint.name] = joint.mimic.multiplier * followed + joint.mimic.offset
+            followed = values[joint.mimic.joint]
+            values[joint.name] = joint.mimic.multiplier * followed + joint.mimic.offset
     said = [f"joints that the table does not name stand still: {', '.join(held)}"] if held else []
-    return np.column_stack([given[joint.name] for joint in robot.movable]), said
+    return np.column_stack([values[joint.name] for joint in robot.movable]), said
 
 
 def _check_positions(robot: Robot, file: str, lines: Sequence[int], rows: np.ndarray) -> None:
