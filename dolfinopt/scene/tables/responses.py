@@ -21,6 +21,7 @@ from dolfinopt.scene.tables.base import (
     Table,
     Three,
     TwoOrThree,
+    wrench,
 )
 
 if TYPE_CHECKING:
@@ -49,17 +50,6 @@ class StiffnessCase(Table):
     displacement: Distance | None = None
     rotation: Angle | None = None
 
-    @property
-    def load(self) -> tuple[float, ...]:
-        """Force and moment, three components in the plane and six in space."""
-        force, moment = self.force, self.moment
-        spatial = isinstance(moment, tuple) or (force is not None and len(force) == 3)
-        none = 3 * (0.0,) if spatial else (0.0, 0.0)
-        turning = moment if isinstance(moment, tuple) else (moment or 0.0,)
-        if spatial and moment is None:
-            turning = none
-        return (*(force or none), *turning)
-
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse what is no arm with a design, no load on it, or without limit."""
         names = [arm.name for arm in scene.arms if arm.flexible]
@@ -67,9 +57,10 @@ class StiffnessCase(Table):
             raise Refusal(f"expected the name of an arm with a design: {', '.join(names)}", ".arm")
         if self.displacement is None and self.rotation is None:
             raise Refusal("expected displacement or rotation, or both", "")
-        if not any(self.load):
+        load = wrench(self, scene.dimension)
+        if not any(load):
             raise Refusal("expected force or moment, not all of them zero", "")
-        if len(self.load) != (6 if scene.is_spatial else 3):
+        if len(load) != (6 if scene.is_spatial else 3):
             kind = "three components each" if scene.is_spatial else "two components and one number"
             raise Refusal(f"expected force and moment of {kind} in this scene", "")
 
