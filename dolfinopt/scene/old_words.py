@@ -168,20 +168,20 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "motion.start_angle": lambda angle, joints, *_: [angle, *(joints or [])[1:]],
 }
 
-OLD_WORDS = tuple(OldWord(old, **entry) for old, entry in tables_of("scene/old_words.toml").items())
+OLD_WORDS = {old: OldWord(old, **entry) for old, entry in tables_of("scene/old_words.toml").items()}
 
 
 def is_old(path: tuple[Any, ...]) -> bool:
     """Return whether a path of a scene is that of an older key, or lies below one."""
     keys = [str(part) for part in path if not isinstance(part, int)]
-    return keys[0] == CLOSURE or any(word.old == ".".join(keys[:2]) for word in OLD_WORDS)
+    return keys[0] == CLOSURE or ".".join(keys[:2]) in OLD_WORDS
 
 
 def in_new_words(key: str) -> str:
     """Return a dotted key in the words of now, as --set takes it; one of now as it is."""
     place, _, name = key.rpartition(".")
     table = place.partition(".")[0]
-    word = next((item for item in OLD_WORDS if item.old == f"{table}.{name}"), None)
+    word = OLD_WORDS.get(f"{table}.{name}")
     if word is None:
         return f"closures.0.{name}" if place == CLOSURE else key
     if TRANSLATIONS.get(word.old) is _scaled:
@@ -206,7 +206,7 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
         InputError: a scene states older and newer word of the same.
     """
     told = _read_closure(tree, source, anew)
-    for word in OLD_WORDS:
+    for word in OLD_WORDS.values():
         table, key = word.old.split(".")
         for row in rows(tree, table):
             if key not in row:

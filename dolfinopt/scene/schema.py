@@ -350,7 +350,7 @@ class Scene(Table):
         # Closures first: which joints are driven depends on them; then what sits on interfaces,
         # since one with a wrong name elsewhere seems to be of no use.
         first = ("closures", "forces", "joints", "payload")
-        for key in (*first, *(key for key in type(self).model_fields if key not in first)):
+        for key in dict.fromkeys((*first, *type(self).model_fields)):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):
