@@ -314,15 +314,15 @@ def _robot_files(
     from dolfinopt.part.workshop_files import triangle_bytes
 
     before = read_robot(origin.file).links
-    links, arms = [], {arm.name: arm for arm in scene.arms}
-    files, said = {}, []
+    links, files, said = [], {}, []
     for name, link in origin.links.items():
         if name not in now or link not in before:
             warn([f"{name}: no solid arm of this scene, or no link {link!r}: it stays as it is"])
             continue
         frame, mesh = origin.frames[name], f"{name}.stl"
         body, surface = now[name]
-        arm, end = arms[name], np.array([arms[name].length, 0.0, 0.0])
+        arm = scene.arms[scene.places[name]]
+        end = np.array([arm.length, 0.0, 0.0])
         own = Inertia(float(body.mass), *body.inertia_about_centre())
         motor = Inertia(arm.joint_mass, end, arm.joint_inertia * np.eye(3))
         inertia = (own + motor).posed(frame)

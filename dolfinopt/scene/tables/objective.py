@@ -181,12 +181,9 @@ class Objective(Table):
         """Refuse what the removal of all material makes least, unless something keeps it."""
         limited = not all(limited_by(key).lighter for key in scene.limits)
         if self.response.lighter and self.direction != "maximize" and not limited:
-            least = "the lightest design is an empty one"
-            if self.kind != "mass":
-                least = "the design that drives feel least is an empty one"
             raise Refusal(
-                f"expected a limit under [constraints] with it, for example deviation: without "
-                f"one {least}",
+                "expected a limit under [constraints] with it, for example deviation: without one "
+                "the best design is an empty one",
                 "objective.kind",
             )
 

@@ -90,7 +90,7 @@ class Limited:
     key: str = ""
     unit: str = ""
     lower: bool = False
-    options: tuple[str, ...] | None = None
+    options: Sequence[str] | None = None
     stated: bool = True
 
 
@@ -121,7 +121,7 @@ class Declaration:
     unit: str
     needs: frozenset[Need] = MOTION
     limit: Limited | None = None
-    options: tuple[str, ...] = ()
+    options: Sequence[str] = ()
     objective: bool = True
     stands_for: str = ""
     natural: Direction = "minimize"
@@ -148,7 +148,7 @@ class Declaration:
         return (self.limit.key or self.name) if self.limit else ""
 
     @property
-    def limit_options(self) -> tuple[str, ...]:
+    def limit_options(self) -> Sequence[str]:
         """Options that the limit uses."""
         own = self.limit.options if self.limit else ()
         return self.options if own is None else own
@@ -163,26 +163,20 @@ def _limited(
     *,
     range: Sequence[float] = (1e-15, 1e15),
     each: bool = False,
-    options: Sequence[str] | None = None,
     **words: Any,
 ) -> Limited:
     """Return the limit of a response, as responses.toml has it."""
     number: Any = Annotated[float, Field(ge=range[0], le=range[1])]
     kind = LIMIT_TYPES.get(name, number | tuple[number, ...] if each else number)
-    return Limited(type=kind, options=None if options is None else tuple(options), **words)
+    return Limited(type=kind, **words)
 
 
 def _declaration(name: str, entry: dict[str, Any]) -> Declaration:
     """Return what a scene says of a response, as responses.toml has it."""
-    limit = entry.pop("limit", None)
-    needs, options = entry.pop("needs", MOTION), entry.pop("options", ())
-    return Declaration(
-        name,
-        needs=frozenset(needs),
-        options=tuple(options),
-        limit=_limited(name, **limit) if limit else None,
-        **entry,
-    )
+    if limit := entry.get("limit"):
+        entry["limit"] = _limited(name, **limit)
+    entry["needs"] = frozenset(entry.get("needs", MOTION))
+    return Declaration(name, **entry)
 
 
 DECLARED = {
