@@ -112,8 +112,10 @@ class Objective(Table):
         self._check_attached(scene)
         count = 6 if scene.is_spatial else 3
         if any(len(load) != count for load in self.static_loads(scene)):
-            what = "six numbers, force and moment, with" if count == 6 else "three numbers without"
-            raise Refusal(f"expected arrays of {what} [[joints]]", "objective.loads")
+            raise Refusal(
+                "expected arrays of six numbers, force and moment, with [[joints]], else of three",
+                "objective.loads",
+            )
         self._check_load_cases(scene)
         self._check_lightest(scene)
         if not need_of(scene, "motion"):

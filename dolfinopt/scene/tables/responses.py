@@ -61,8 +61,11 @@ class StiffnessCase(Table):
         if not any(load):
             raise Refusal("expected force or moment, not all of them zero", "")
         if len(load) != (6 if scene.is_spatial else 3):
-            kind = "three components each" if scene.is_spatial else "two components and one number"
-            raise Refusal(f"expected force and moment of {kind} in this scene", "")
+            raise Refusal(
+                "expected force and moment of three components each with [[joints]], else of two "
+                "components and one number",
+                "",
+            )
 
 
 Cases = tuple[StiffnessCase, ...]
