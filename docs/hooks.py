@@ -110,7 +110,7 @@ def scene_reference() -> str:
         allowed = info.allowed.replace(" | ", " or ")
         lines.append(f"| `{key}` | {_cell(meaning)} | {unit} | {default} | {_cell(allowed)} |")
     lines += ["\n## Older words {#older}\n", OLDER, "| older | now |", "|---|---|"]
-    lines += [f"| `{word.old}` | {_cell(word.told)} |" for word in OLD_WORDS]
+    lines += [f"| `{word.old}` | {_cell(word.told)} |" for word in OLD_WORDS.values()]
     return "\n".join(lines) + "\n"
 
 

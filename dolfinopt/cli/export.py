@@ -29,7 +29,7 @@ from dolfinopt.exchange.urdf.scene import Origin, read_origin
 from dolfinopt.interrupt import ending_at_once
 from dolfinopt.loading import load_scene
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-from dolfinopt.output.design import arms_with_design
+from dolfinopt.output.design import Designed, arms_with_design
 from dolfinopt.output.folders import PARTS, prepare_folder, remove_stale, stale_parts, write_files
 from dolfinopt.parallel import gather_arms, on_root, together
 from dolfinopt.profiling import Profile
@@ -55,34 +55,40 @@ def export(
     below: float | None,
 ) -> None:
     """Write what other programs need of a scene: bodies, a robot, a linearised machine."""
+    is_run = scene.is_dir()
     for name, value in (("design", design), ("set", overrides), ("below", below)):
-        if value not in (None, ()) and name not in FORMATS[kind]:
+        if value in (None, ()):
+            continue
+        if name not in FORMATS[kind]:
             users = " or ".join(word for word, options in FORMATS.items() if name in options)
             raise InputError(f"--{name}: expected with {users}, not with {kind}")
-    is_run = scene.is_dir()
+        if is_run and name != "below":
+            raise InputError(f"--{name}: expected none with the folder of a run, which has its own")
     if kind == "bodies" and is_run:
         raise InputError(f"{scene}: a folder; name a scene file, or add robot or state-space")
     if kind == "bodies" and last is not None:
         raise InputError(f"{last}: expected nothing behind {kind}")
     at = _instant(last) if kind == "state-space" else 0.0
-    if is_run and design is not None:
-        raise InputError("--design: expected none with the folder of a run, which has its own")
-    if not is_run and kind != "robot":
-        loaded = load(world, scene, overrides)
-    elif overrides:
-        raise InputError("--set: expected none with the folder of a run, whose scene it is")
-    else:
+    if is_run or kind == "robot":
         loaded = on_root(world, scene_of, scene)
+    else:
+        loaded = load(world, scene, overrides)
     if kind == "robot":
         _export_robot(world, loaded, scene, out, overwrite, None if last is None else Path(last))
         return
     folder = out or Path("results") / f"{scene.stem}-{kind}"
-    if kind == "bodies":
-        _export_bodies(world, loaded, folder, overwrite, design)
-        return
     if is_run:
         design, folder = scene / "design.npz", out or scene / kind
-    _export_state_space(world, loaded, folder, overwrite, design, at, below)
+    names = [f"{arm.name}{ending}" for arm in loaded.arms for ending in KINDS]
+    check_instant(loaded, at)
+    claim(world, folder, overwrite, names if kind == "bodies" else STATE_SPACE, scene=loaded)
+    place = arms_with_design(world, loaded, design, Profile())
+    tell(choose_coordinates(*place, Profile()))
+    if kind == "bodies":
+        _export_bodies(world, place, folder)
+        return
+    model = linearised_machine(*place, at, Profile(), below=below)
+    on_root(world, _write_state_space, folder, model)
 
 
 def _instant(word: str | None) -> float:
@@ -101,16 +107,10 @@ def _instant(word: str | None) -> float:
 KINDS = (".sid", ".sid.npz", ".fem")
 
 
-def _export_bodies(
-    world: MPI.Comm, scene: Scene, folder: Path, overwrite: bool, design: Path | None
-) -> None:
+def _export_bodies(world: MPI.Comm, place: Designed, folder: Path) -> None:
     """Write the reduced arms of a scene."""
-    names = [f"{arm.name}{kind}" for arm in scene.arms for kind in KINDS]
-    claim(world, folder, overwrite, names, scene=scene)
-    place = arms_with_design(world, scene, design, Profile())
     scene, partition, arms, x_phys = place
     on_root(world, prepare_folder, folder)
-    tell(choose_coordinates(*place, Profile()))
     with together(world):
         for k, arm in arms.items():
             arm.state(x_phys[k])
@@ -137,30 +137,9 @@ def _export_bodies(
 STATE_SPACE = ("state_space.npz", "state_space.mat")
 
 
-def _export_state_space(
-    world: MPI.Comm,
-    scene: Scene,
-    folder: Path,
-    overwrite: bool,
-    design: Path | None,
-    at: float,
-    below: float | None,
-) -> None:
-    """Write a machine linearised at an instant, s."""
-    check_instant(scene, at)
-    claim(world, folder, overwrite, STATE_SPACE, scene=scene)
-    profile = Profile()
-    place = arms_with_design(world, scene, design, profile)
-    tell(choose_coordinates(*place, profile))
-    model = linearised_machine(*place, at, profile, below=below)
-    on_root(world, prepare_folder, folder)
-    with together(world):
-        if world.rank == 0:
-            _write_state_space(folder, model)
-
-
 def _write_state_space(folder: Path, model: StateSpace) -> None:
     """Write both files and say what they hold (root only)."""
+    prepare_folder(folder)
     arrays, npz, mat = model.arrays(), *(folder / name for name in STATE_SPACE)
     # MATLAB has cell arrays for words of several lengths.
     cells = {k: x.astype(object) if x.dtype.kind == "U" else x for k, x in arrays.items()}
@@ -264,28 +243,21 @@ def _links(world: MPI.Comm, scene: Scene, run: Path) -> _Links:
     from dolfinopt.part.folder import SCENE
     from dolfinopt.part.part import make_parts
 
-    folder = run / PARTS
+    folder, owners = run / PARTS, dict(zip(scene.places, scene.owners, strict=True))
     if not on_root(world, lambda: (folder / SCENE).is_file() and not stale_parts(folder)):
-        bodies, parts = (
-            _reduced(world, scene, run / "design.npz"),
-            make_parts(scene, run, world=world),
-        )
-        owners = dict(zip((arm.name for arm in scene.arms), scene.owners, strict=True))
+        bodies = _reduced(world, scene, run / "design.npz")
+        parts = make_parts(scene, run, world=world)
         return {name: (bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
     machine: Scene = on_root(world, load_scene, folder / SCENE)
     bodies = _reduced(world, machine, None)
-    files = {item.name: folder / f"{_owner(scene, item.name)}.stl" for item in machine.arms}
-    return {
-        item.name: (bodies[k], _surface(files[item.name]))
-        for k, item in enumerate(machine.arms)
-        if k in bodies and files[item.name].is_file()
-    }
-
-
-def _owner(scene: Scene, name: str) -> str:
-    """Return the name of the arm whose design an arm has."""
-    owner = scene.owners[[arm.name for arm in scene.arms].index(name)]
-    return name if owner is None else scene.arms[owner].name
+    links = {}
+    for k, arm in enumerate(machine.arms):
+        owner = owners.get(arm.name)
+        if k in bodies and owner is not None:
+            file = folder / f"{scene.arms[owner].name}.stl"
+            if file.is_file():
+                links[arm.name] = bodies[k], _surface(file)
+    return links
 
 
 def _surface(file: Path) -> np.ndarray:
@@ -342,15 +314,15 @@ def _robot_files(
     from dolfinopt.part.workshop_files import triangle_bytes
 
     before = read_robot(origin.file).links
-    links, arms = [], {arm.name: arm for arm in scene.arms}
-    files, said = {}, []
+    links, files, said = [], {}, []
     for name, link in origin.links.items():
         if name not in now or link not in before:
             warn([f"{name}: no solid arm of this scene, or no link {link!r}: it stays as it is"])
             continue
         frame, mesh = origin.frames[name], f"{name}.stl"
         body, surface = now[name]
-        arm, end = arms[name], np.array([arms[name].length, 0.0, 0.0])
+        arm = scene.arms[scene.places[name]]
+        end = np.array([arm.length, 0.0, 0.0])
         own = Inertia(float(body.mass), *body.inertia_about_centre())
         motor = Inertia(arm.joint_mass, end, arm.joint_inertia * np.eye(3))
         inertia = (own + motor).posed(frame)

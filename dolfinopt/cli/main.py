@@ -78,7 +78,7 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
         click.echo(json.dumps(scene_schema(), indent=2))
         return
     known = describe_keys()
-    result = [info for info in known if _fits(info, pattern)]
+    result = [info for info in known if _fits(info, pattern or "*")]
     materials = _materials(pattern, result)
     if not result and not materials:
         paths = [info.key for info in known]
@@ -105,14 +105,11 @@ def _upgrade(scene: Path) -> None:
     click.echo(f"{scene}: rewritten; as it was: {kept}")
 
 
-def _fits(info: KeyInfo, pattern: str | None) -> bool:
-    if pattern is None:
-        return True
+def _fits(info: KeyInfo, pattern: str) -> bool:
     name = info.key.rpartition(".")[2]
     paths = (info.key, *(f"{table}.{name}" for table in info.also))
-    if re.search(r"[*?\[]", pattern):
-        return any(fnmatchcase(path, pattern) for path in paths)
-    return any(pattern in path for path in paths)
+    glob = pattern if re.search(r"[*?\[]", pattern) else f"*{pattern}*"
+    return any(fnmatchcase(path, glob) for path in paths)
 
 
 def _materials(pattern: str | None, infos: list[KeyInfo]) -> list[str]:

@@ -51,8 +51,6 @@ def optimize(
     verbose: bool,
 ) -> None:
     """Optimise the arms of SCENE for the loads of their motion."""
-    if resume and overwrite:
-        raise InputError("--resume, --overwrite: expected only one of them")
     loaded = load(world, scene, overrides)
     loaded.check_designed()
     tell_assumed(loaded)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 from mpi4py import MPI
@@ -76,12 +77,16 @@ def part(
     with together(world):
         if world.rank == 0:
             warn(dict.fromkeys(text for item in parts.values() for text in item.warnings))
-            done = PartsJob(scene, parts, _meshes(parts, check or bool(asked.optimize), say))
-            done = done.checked(folder, say) if check else done
+            meshes = _meshes(parts, check or bool(asked.optimize), say)
+            done = PartsJob(scene, folder, say, parts, meshes)
+            if check:
+                done.simulate()
             if asked.optimize and done.meshes is not None:
-                done = done.optimized(folder, asked, check, say, kept.replace, known)
+                done.optimize(asked, kept.replace, known)
+                if check:
+                    done.simulate()
             say("files")
-            done.write(folder, target, plots)
+            done.write(target, plots)
             if done.shape is None or not done.shape.interrupted:
                 kept.remove()
     if world.rank == 0:
@@ -97,11 +102,7 @@ def part(
 @contextmanager
 def _ended_as_interrupted() -> Iterator[None]:
     """Let what ends a job in a queue (SIGTERM) raise KeyboardInterrupt, as Ctrl-C does."""
-
-    def interrupt(number: int, frame: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield
     finally:
@@ -118,12 +119,14 @@ def _meshes(parts: Mapping[int, Part], coarse: bool, say: Say) -> Meshes | None:
         return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class PartsJob:
     """What the command has come to so far, on the root.
 
     Attributes:
         scene: of the run.
+        run: its folder.
+        say: is told what is done next.
         parts: by their place in the chain.
         meshes: of the parts; None: there are none.
         check: what the parts do; None: it is not known.
@@ -131,55 +134,48 @@ class PartsJob:
     """
 
     scene: Scene
+    run: Path
+    say: Say
     parts: Mapping[int, Part]
     meshes: Meshes | None
     check: Check | None = None
     shape: Optimized | None = None
 
-    def checked(self, run: Path, say: Say) -> PartsJob:
-        """Return it with what the parts do, or a warning where that cannot be simulated.
-
-        What is known is of the parts before, which stand beside these.
-        """
+    def simulate(self) -> None:
+        """Find what the parts do, beside those before; warn where that cannot be simulated."""
         from dolfinopt.part.check import check_parts  # a second's imports
 
         if self.meshes is None:
-            return self
+            return
+        known, self.check = self.check, None
         try:
-            given = self.scene, run, self.parts, self.meshes, say, self.check
-            return replace(self, check=check_parts(*given))
+            self.check = check_parts(self.scene, self.run, self.parts, self.meshes, self.say, known)
         except ConvergenceError as error:
             warn([f"the machine with the parts cannot be compared: {error}"])
-            return replace(self, check=None)
 
-    def optimized(
-        self, run: Path, asked: Asked, check: bool, say: Say, keep: Keep, known: Sequence[Saved]
-    ) -> PartsJob:
-        """Return it with optimised shapes, the parts before beside them in the check."""
-
+    def optimize(self, asked: Asked, keep: Keep, known: Sequence[Saved]) -> None:
+        """Optimise the shapes."""
         from dolfinopt.part.optimize import optimize_parts
 
-        def tell(line: str) -> None:
-            click.echo(line, err=True)
-
-        say("shapes")
+        self.say("shapes")
+        before = None if self.check is None else self.check.part
+        tell = partial(click.echo, err=True)
         with _ended_as_interrupted():
-            given = self.scene, self.parts, asked.iterations, tell, asked.starts
-            before = None if self.check is None else self.check.part
-            result = optimize_parts(*given, keep, known, before)
-        click.echo("\n".join(result.sentences))
-        after = replace(self, parts=result.parts, meshes=result.meshes, shape=result)
-        return after.checked(run, say) if check else after
+            self.shape = optimize_parts(
+                self.scene, self.parts, asked.iterations, tell, asked.starts, keep, known, before
+            )
+        click.echo("\n".join(self.shape.sentences))
+        self.parts, self.meshes = self.shape.parts, self.shape.meshes
 
-    def write(self, run: Path, target: Path, plots: bool) -> None:
+    def write(self, target: Path, plots: bool) -> None:
         """Write the files, all or none."""
         prepare_folder(target)
         meshes = None if self.meshes is None else self.meshes.fine
         if self.check is not None:
             meshes = self.check.meshes
         drawn = self.draw if plots else None
-        given = self.scene, self.parts, meshes, self.check, self.shape
-        write_parts(target, *given, drawn, run / "design.npz")
+        design = self.run / "design.npz"
+        write_parts(target, self.scene, self.parts, meshes, self.check, self.shape, drawn, design)
 
     def draw(self, folder: Path) -> None:
         """Write the picture of the parts, and those of what they do if that is known."""

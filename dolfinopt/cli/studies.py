@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import click
 from mpi4py import MPI
 
+from dolfinopt.cli.begin import elapsed
 from dolfinopt.cli.shared import load, progress
 from dolfinopt.disk import write_text
 from dolfinopt.errors import ConvergenceError, InputError
@@ -224,13 +224,11 @@ def _measure(world: MPI.Comm, names: tuple[str, ...], out: Path | None, quick: b
     from dolfinopt.paper.reproduction import load_paper
 
     chosen = named(names)
-    begun = time.perf_counter()
     folder = out or Path("results") / "bench"
     prepare_folder(folder)
     plan = Plan(load_paper(overrides=QUICKLY if quick else ()), quick)
     say = progress(world, "bench")
     failures = run(plan, folder, chosen, say, partial(click.echo, err=True))
-    seconds = time.perf_counter() - begun
-    click.echo(f"diagrams in {folder}, summary in {folder / 'bench.md'}; {seconds:.0f} s")
+    click.echo(f"diagrams in {folder}, summary in {folder / 'bench.md'}; {elapsed():.0f} s")
     if failures:
         raise ConvergenceError("; ".join(failures))

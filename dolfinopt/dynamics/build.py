@@ -50,6 +50,7 @@ from dolfinopt.profiling import Profile
 from dolfinopt.scene.duration import stamp
 from dolfinopt.scene.law_variables import law_bounds, law_names, law_values, with_law
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.base import wrench
 from dolfinopt.scene.tables.joints import place_of
 from dolfinopt.scene.tables.machine import FORCE_COLUMNS, Control, Force
 
@@ -275,7 +276,7 @@ def loads_of(scene: Scene) -> tuple[Table, ...]:
 
 def _load(force: Force, dimension: int, lead: float) -> Table:
     """Return force and moment, (3,) or in space (6,), and the table's."""
-    constant = np.array([*force.force_in(dimension), *force.moment_in(dimension)])
+    constant = np.array(wrench(force, dimension))
     table = Table(np.zeros(1), np.zeros((1, len(constant))))
     if force.table is not None:
         table = read_forces(force.table, FORCE_COLUMNS[dimension])

@@ -484,8 +484,7 @@ def _tensor(inertia: float | Inertia) -> Inertia:
 def _loads(scene: Scene) -> dict[Site, Constants]:
     """Return what the arms carry at interfaces without a joint: motors and the payload."""
     payload, result = scene.payload, {}
-    inertia = payload.inertia if scene.is_spatial else payload.moment
-    result[scene.end_effector] = _carried(scene, payload.mass, inertia, payload.offset)
+    result[scene.end_effector] = _carried(scene, payload.mass, payload.inertia, payload.offset)
     for k, arm in enumerate(scene.arms):
         if arm.joint_mass or arm.joint_inertia:
             motor = _carried(scene, arm.joint_mass, arm.joint_inertia)

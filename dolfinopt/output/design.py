@@ -474,18 +474,20 @@ def write_fields(folder: Path, views: Sequence[ArmView]) -> None:
 
 def write_history(path: Path, rows: Sequence[HistoryRow]) -> None:
     """Begin the file anew with the rows known so far."""
-    write_text(path, _lines(rows, headed=True) if rows else "")
+    header = [",".join(row.figures) + "\n" for row in rows[:1]]
+    write_text(path, "".join([*header, *map(_line, rows)]))
 
 
 def append_history(path: Path, row: HistoryRow) -> None:
     """Add one line; the first row brings the header, too."""
-    append_text(path, _lines([row], headed=path.stat().st_size == 0))
+    if path.stat().st_size:
+        append_text(path, _line(row))
+    else:
+        write_history(path, [row])
 
 
-def _lines(rows: Sequence[HistoryRow], headed: bool) -> str:
-    lines = [list(rows[0].figures)] * headed
-    lines += [[f"{value:.10g}" for value in row.figures.values()] for row in rows]
-    return "".join(",".join(line) + "\n" for line in lines)
+def _line(row: HistoryRow) -> str:
+    return ",".join(f"{value:.10g}" for value in row.figures.values()) + "\n"
 
 
 def read_history(path: Path) -> list[HistoryRow]:

@@ -136,12 +136,10 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
     if seen.feed_forward is None:
         return
     joints = scene.driven_columns
-    rate, drive = BESIDE_JOINTS
-    columns = [seen.t, seen.commanded.q[:, joints], seen.commanded.qd[:, joints]]
-    header = ["t", *scene.driven, *(f"{rate}{name}" for name in scene.driven)]
-    columns.append(seen.joint_forces[:, joints])
-    header += [f"{drive}{name}" for name in scene.driven]
-    write_table(folder / FILE, header, columns, 15)
+    quantities = seen.commanded.q, seen.commanded.qd, seen.joint_forces
+    columns = [values[:, joints] for values in quantities]
+    header = [f"{kind}{name}" for kind in ("", *BESIDE_JOINTS) for name in scene.driven]
+    write_table(folder / FILE, ["t", *header], [seen.t, *columns], 15)
 
 
 def summary_of_feed_forward(

@@ -134,17 +134,13 @@ def check_unused(folder: Path, names: Collection[str] = RUN_FILES, *, resume: st
         )
 
 
-def remove_stale(
-    folder: Path, names: Collection[str] = RUN_FILES, *, keep: Collection[str] = ()
-) -> None:
-    """Remove what an earlier run left, but for `keep`; other files stay.
+def remove_stale(folder: Path, names: Iterable[str] = RUN_FILES) -> None:
+    """Remove what an earlier run left; other files stay.
 
     Raises:
         InputError: a file cannot be removed.
     """
     for name in names:
-        if name in keep:
-            continue
         try:
             with suppress(FileNotFoundError):
                 (folder / name).unlink()

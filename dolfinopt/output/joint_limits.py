@@ -9,6 +9,7 @@ import numpy as np
 
 from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.measured import FILE_ROUNDING
+from dolfinopt.output.trajectory import FORCE_OF
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,11 @@ def joint_limits(trajectory: Trajectory) -> Iterator[JointLimit]:
     """Yield how a motion stands to every limit of position, velocity and effort."""
     motion, forces = trajectory.motion, trajectory.joint_forces
     for k, joint in enumerate(trajectory.scene.movable):
-        unit, force = ("m", "N") if joint.type == "prismatic" else ("rad", "N m")
+        unit = trajectory.scene.rigid_units[joint.name]
         for quantity, bounds, values, of in (
             ("position", joint.position_limits, motion.q, unit),
             ("velocity", joint.velocity_limit, motion.qd, f"{unit}/s"),
-            ("effort", joint.effort_limit, forces, force),
+            ("effort", joint.effort_limit, forces, FORCE_OF[unit]),
         ):
             if bounds is None:
                 continue

@@ -217,8 +217,8 @@ def optimize(
             if resume:
                 memory = checkpoint.load(folder, scene, *built)
                 # What will be written anew goes, so that nothing old stands beside it.
-                kept = (checkpoint.NAME, HISTORY)
-                on_root(world, partial(remove_stale, keep=kept), folder)
+                old = [name for name in RUN_FILES if name not in (checkpoint.NAME, HISTORY)]
+                on_root(world, remove_stale, folder, old)
             recorder = FolderRecorder(folder, scene, *built)
         evaluator = Evaluator(scene, *built, profile)
         return Optimization(evaluator, recorder, report, compared, x0).go(memory)

@@ -282,19 +282,19 @@ def write_report(
     *, plots: bool = True,
 ) -> None:  # fmt: skip
     """Write figNN.csv, measured.json and, with plots, figNN.png and report.html (root only)."""
-    figures = {f"fig{number:02d}": pair for number, pair in all_figures(results, outcomes).items()}
+    figures = all_figures(results, outcomes)
     records = results[MEASURED].to_json(orient="records", double_precision=15, indent=1)
     write_text(folder / "measured.json", records + "\n")
-    for name, (_, data) in figures.items():
-        write_text(folder / f"{name}.csv", data.csv())
+    for number, (_, data) in figures.items():
+        write_text(folder / f"fig{number:02d}.csv", data.csv())
     if not plots:
         return
     from dolfinopt.study.figures import draw_all
 
-    files = draw_all({name: item for name, (item, _) in figures.items()}, folder)
+    files = draw_all({f"fig{n:02d}": item for n, (item, _) in figures.items()}, folder)
     pictures = [
-        (int(name[3:]), item.title, file.read_bytes())
-        for (name, (item, _)), file in zip(figures.items(), files, strict=True)
+        (number, item.title, file.read_bytes())
+        for (number, (item, _)), file in zip(figures.items(), files, strict=True)
     ]
     tables = [data for _, data in figures.values() if isinstance(data, Table)]
     differing = variants.differences(load_paper(), plan.scene).items()
@@ -378,8 +378,10 @@ def quantities(results: pd.DataFrame) -> dict[str, Any]:
     curves, reductions = by["coordinates"], by["reductions"].sort_values("x").astype({"x": int})
     cms, modal = (reductions[reductions.kind == method] for method in METHODS)
     return {
-        **{"few_cms": cms.iloc[0], "many_cms": cms.iloc[-1]},
-        **{"few_modal": modal.iloc[0], "many_modal": modal.iloc[-1]},
+        "few_cms": cms.iloc[0],
+        "many_cms": cms.iloc[-1],
+        "few_modal": modal.iloc[0],
+        "many_modal": modal.iloc[-1],
         "cms_change": abs(cms.compliance.iloc[0] / cms.compliance.iloc[-1] - 1.0),
         "before": _of_coordinates(curves[curves.label == INITIAL]),
         "after": _of_coordinates(curves[curves.label == OPTIMUM]),

@@ -24,6 +24,7 @@ from dolfinopt.responses.response import (
 )
 from dolfinopt.responses.sensitivity import static_response, tip_gradient
 from dolfinopt.scene.load import Scene
+from dolfinopt.scene.tables.base import wrench
 from dolfinopt.scene.tables.objective import Objective
 from dolfinopt.scene.tables.responses import StiffnessCase
 
@@ -260,7 +261,8 @@ class Stiffness(TipDeflection):
         owners = {arm.name: k for arm, k in zip(scene.arms, scene.owners, strict=True)}
         result, d = [], scene.dimension
         for number, case in enumerate(self.limits, 1):
-            name, loads, owner = f"{case.arm}_case{number}", np.array([case.load]), owners[case.arm]
+            name, owner = f"{case.arm}_case{number}", owners[case.arm]
+            loads = np.array([wrench(case, d)])
             assert owner is not None  # the scene has checked that
             if case.displacement is not None:
                 result.append(LoadedArm(name, owner, loads, slice(d)))

@@ -59,7 +59,7 @@ def read_table(
     if not lines:
         raise InputError(f"{file}: no rows; a line of column names is needed: {allowed}")
     number, names = lines[0]
-    kept = [k for k, name in enumerate(names) if not (ignored and name.startswith(ignored))]
+    kept = [k for k, name in enumerate(names) if not name.startswith(ignored)]
     names = [names[k] for k in kept]
     for name in dict.fromkeys([*names, *columns]):
         wrong = {0: "missing", 1: ""}.get(names.count(name), "repeated")

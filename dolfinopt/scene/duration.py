@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from functools import lru_cache
 
@@ -70,8 +71,7 @@ def path_length(motion: Motion) -> float:
     if motion.path == "arc":
         return np.pi * motion.radius
     if motion.path == "line":
-        way = np.subtract(motion.end, motion.start)
-        return float(np.hypot(*way) if len(way) == 2 else np.linalg.norm(way))
+        return math.dist(motion.start, motion.end)
     assert motion.file is not None
     return _chords(motion.file, stamp(motion.file))
 

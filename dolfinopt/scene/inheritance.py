@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -48,16 +49,11 @@ def inherit(tree: Tree, keys: Iterable[str]) -> set[Loc]:
     fixed = [row.get("child") for row in rows(tree, "joints") if row.get("type") == "fixed"]
     before: dict[str, Any] = {}
     for i, arm in enumerate(rows(tree, "arms")):
-        taken = {key for keys in _replaced(arm) for key in keys}
+        taken = {*arm, *OWN_KEYS, *chain.from_iterable(_replaced(arm))}
         if arm.get("name") in fixed:
             taken.update(key for key in DRIVE_KEYS if key not in OF_BEARINGS)
         for key in keys:
-            if (
-                before.get(key) is not None
-                and key not in arm
-                and key not in taken
-                and key not in OWN_KEYS
-            ):
+            if key not in taken and before.get(key) is not None:
                 arm[key] = copied(before[key])
                 inherited.add(("arms", i, key))
         if ("arms", i, "mesh") in inherited:

@@ -162,10 +162,8 @@ def resolve_file(source: str, value: str, key: str, where: str = "") -> str:
     for path in paths:
         if os.path.isfile(path):
             return path
-    tried = "neither " if len(paths) > 1 else "not "
-    tried += " nor ".join(paths)
     raise input_error(
         where or source,
         f"{key} = {shown(value)}: expected the path of a file, from the scene's folder or the "
-        f"working directory; found {tried}",
+        f"working directory; there is no {' and no '.join(paths)}",
     )

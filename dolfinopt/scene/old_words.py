@@ -86,10 +86,14 @@ def _scaled(factor: Any, value: Any, row: Row, tree: Tree) -> Any:
     return scaled(value, factor)
 
 
+def _last_arm(tree: Tree) -> Any:
+    return next((arm.get("name") for arm in reversed(rows(tree, "arms"))), "")
+
+
 def _site(interface: Any, arm: Any, row: Row, tree: Tree) -> str:
     """Return "arm.interface" of the arm that a row states, else of the last one."""
     if arm is None:
-        arm = next((item.get("name") for item in reversed(rows(tree, "arms"))), "")
+        arm = _last_arm(tree)
     name = site_of(str(arm))[0]
     return name if str(interface).casefold() == OUTBOARD else f"{name}.{interface}"
 
@@ -164,20 +168,20 @@ TRANSLATIONS: Mapping[str, Translation] = {
     "motion.start_angle": lambda angle, joints, *_: [angle, *(joints or [])[1:]],
 }
 
-OLD_WORDS = tuple(OldWord(old, **entry) for old, entry in tables_of("scene/old_words.toml").items())
+OLD_WORDS = {old: OldWord(old, **entry) for old, entry in tables_of("scene/old_words.toml").items()}
 
 
 def is_old(path: tuple[Any, ...]) -> bool:
     """Return whether a path of a scene is that of an older key, or lies below one."""
     keys = [str(part) for part in path if not isinstance(part, int)]
-    return keys[0] == CLOSURE or any(word.old == ".".join(keys[:2]) for word in OLD_WORDS)
+    return keys[0] == CLOSURE or ".".join(keys[:2]) in OLD_WORDS
 
 
 def in_new_words(key: str) -> str:
     """Return a dotted key in the words of now, as --set takes it; one of now as it is."""
     place, _, name = key.rpartition(".")
     table = place.partition(".")[0]
-    word = next((item for item in OLD_WORDS if item.old == f"{table}.{name}"), None)
+    word = OLD_WORDS.get(f"{table}.{name}")
     if word is None:
         return f"closures.0.{name}" if place == CLOSURE else key
     if TRANSLATIONS.get(word.old) is _scaled:
@@ -202,7 +206,7 @@ def read_old_words(tree: Tree, source: str, anew: bool = False) -> list[str]:
         InputError: a scene states older and newer word of the same.
     """
     told = _read_closure(tree, source, anew)
-    for word in OLD_WORDS:
+    for word in OLD_WORDS.values():
         table, key = word.old.split(".")
         for row in rows(tree, table):
             if key not in row:
@@ -246,31 +250,28 @@ def _read_closure(tree: Tree, source: str, anew: bool) -> list[str]:
     others = not anew and (tree.get("closures") or tree.get("joints"))
     if others or not isinstance(table, dict):
         raise input_error(source, "closure: expected [[closures]], of which it is an older word")
-    last = [arm.get("name") for arm in rows(tree, "arms")][-1:]
-    tree["closures"] = tree.get("closures") or [{"name": CLOSURE, "between": [*last, GROUND]}]
-    for row in rows(tree, "closures")[:1]:
-        before, load = _unit(row.get("axis")), table.pop("force", None)
-        row.update({"axis" if key == "direction" else key: x for key, x in table.items()})
-        if row.get("kind") == "slider":
-            row.setdefault("axis", [1.0, 0.0])
-        elif row.get("axis") == [1.0, 0.0]:
-            del row["axis"]  # the default of a line
-        forces = [force for force in rows(tree, "forces") if force.get("name") == CLOSURE]
-        if load and not forces:
-            forces = [{"name": CLOSURE, "arm": last[0]}]
-            tree["forces"] = [*(tree.get("forces") or []), *forces]
-        for force in forces:
-            if load is not None:
-                force["factor"] = load
-            if load is not None or force.get("force") == before:
-                force["force"] = _unit(row.get("axis"))
+    arm, load = _last_arm(tree), table.pop("force", None)
+    tree["closures"] = tree.get("closures") or [{"name": CLOSURE, "between": [arm, GROUND]}]
+    row = tree["closures"][0]
+    row.update(table)
+    axis = row["axis"] = row.pop("direction", row.get("axis", [1.0, 0.0]))
+    if row.get("kind") != "slider" and axis == [1.0, 0.0]:
+        del row["axis"]  # the default of a line
+    forces = [force for force in rows(tree, "forces") if force.get("name") == CLOSURE]
+    if load and not forces:
+        forces = [{"name": CLOSURE, "arm": arm}]
+        tree["forces"] = [*(tree.get("forces") or []), *forces]
+    for force in forces:
+        if load is not None:
+            force["factor"] = load
+        if load is not None or "direction" in table:
+            force["force"] = _unit(axis)
     return [OLD_CLOSURE]
 
 
 def _unit(axis: Any) -> list[float]:
     """Return an axis of the plane of length 1; along x where it is none, which is refused."""
     try:
-        size = math.hypot(*axis[:2])
-        return [x / size for x in axis[:2]]
+        return [x / math.hypot(*axis[:2]) for x in axis[:2]]
     except (TypeError, ZeroDivisionError):
         return [1.0, 0.0]

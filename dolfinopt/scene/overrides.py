@@ -42,14 +42,13 @@ def override(tree: Tree, text: str, source: str) -> Override:
     if not equals or not all(parts):
         raise input_error(where, "expected key.path=value, for example payload.mass=4.0")
     given = _parse_value(value.strip())
-    if parts[0] == CLOSURE:
-        _store(tree, parts, given)
-        return Override(text, (("closures", 0), ("forces",)))
     check_tables(tree, source)
     locs = _locs(tree, parts, where)
     for loc in locs:
         _drop_replaced(tree, loc)
         _store(tree, loc, scaled(value_at(loc, tree)[0], given) if times else given)
+    if parts[0] == CLOSURE:
+        return Override(text, (("closures", 0), ("forces",)))
     return Override(text, tuple(loc[:2] if is_old(loc) else loc for loc in locs))
 
 
@@ -78,7 +77,8 @@ def _locs(tree: Tree, parts: tuple[str, ...], where: str) -> tuple[Loc, ...]:
     """Return the paths that a dotted key means: of one row of an array of tables, or of all."""
     locs: tuple[Loc, ...] = (parts,)
     table, fields = parts[0], getattr(model_at(parts[:1]), "model_fields", {})
-    if "name" in fields and _is_array(parts[:1]) and len(parts) > 1 and table in {*tree, "arms"}:
+    named = "name" in fields and is_array(field_at(parts[:1]))
+    if named and len(parts) > 1 and table in {*tree, "arms"}:
         members = range(len(rows(tree, table)))
         if len(parts) == 2 and (parts[1] in fields or is_old(parts)):
             locs = tuple((table, i, parts[1]) for i in members)
@@ -103,18 +103,11 @@ def _check_known(tree: Tree, loc: Loc, where: str) -> None:
         parent = model_at(above)
         if isinstance(key, int):
             continue
-        if parent is None or _is_array(above):
+        if parent is None or (above and is_array(field_at(above))):
             remedy = f"set {dotted(above, tree)} as a whole: {allowed_words(field_at(above))}"
             raise input_error(where, f"unknown key {dotted(loc, tree)}; {remedy}")
         if key not in parent.model_fields:
             raise input_error(where, unknown_key(above, key, parent.model_fields, tree))
-
-
-def _is_array(loc: Loc) -> bool:
-    """Tell whether `loc` is the path of an array of tables."""
-    if not loc or isinstance(loc[-1], int):
-        return False
-    return is_array(field_at(loc))
 
 
 def _store(tree: Tree, loc: Loc, value: Any) -> None:

@@ -70,6 +70,7 @@ def region_problem(arm: Arm, cells: Cells) -> tuple[int, str] | None:
     both interfaces are joined by cells that may be solid, and so is every cell that must be.
     """
     result = region_cells(arm, cells.centroid)
+    solid = cells.passive | result.solid
     y, z = 0.5 * arm.height, 0.5 * arm.thickness
     for number, inside in enumerate(result.each):
         if not inside.any():
@@ -78,13 +79,10 @@ def region_problem(arm: Arm, cells: Cells) -> tuple[int, str] | None:
                 f"z from {-z:g} to {z:g} [m], and the size of a cell at least: it covers the "
                 "centroid of no cell"
             )
-    solid = cells.passive | result.solid
-    for number, inside in enumerate(result.each):
         if arm.regions[number].kind == "void" and (both := int((inside & solid).sum())):
-            ends = "in the solid ends or " if (inside & cells.passive).any() else "in "
             return number, (
-                f"expected no cell that is kept solid: {both} of its cells are {ends}"
-                "a solid region, too; move it, or shorten arms.passive"
+                f"expected no cell that is kept solid: {both} of its cells are in a solid region "
+                "or the solid ends, too; move it, or shorten arms.passive"
             )
     if not result.void.any():
         return None

@@ -16,6 +16,7 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from dolfinopt import version
 from dolfinopt.data import mesh_folder
+from dolfinopt.disk import open_input
 from dolfinopt.errors import InputError
 from dolfinopt.scene.tables.arms import MAX_ARMS, Arm
 from dolfinopt.scene.tables.base import NAMES_FILE, Refusal, Table, rows, table_in
@@ -350,7 +351,7 @@ class Scene(Table):
         # Closures first: which joints are driven depends on them; then what sits on interfaces,
         # since one with a wrong name elsewhere seems to be of no use.
         first = ("closures", "forces", "joints", "payload")
-        for key in (*first, *(key for key in type(self).model_fields if key not in first)):
+        for key in dict.fromkeys((*first, *type(self).model_fields)):
             value = getattr(self, key)
             tables = value if isinstance(value, tuple) else [value]
             for i, table in enumerate(tables):
@@ -517,8 +518,5 @@ def file_digest(path: Path) -> str:
     """
     import hashlib  # 2 ms, which help and most scenes do not need
 
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    return hashlib.sha256(content).hexdigest()
+    with open_input(path) as stream:
+        return hashlib.sha256(stream.read()).hexdigest()

@@ -39,6 +39,7 @@ import numpy as np
 from dolfinopt.data import filled
 from dolfinopt.disk import write_text
 from dolfinopt.errors import InputError
+from dolfinopt.scene.tables.base import cut
 
 MOST = 500  # coordinates: every matrix is kept with its derivative by all of them
 
@@ -392,8 +393,7 @@ class _Item:
         return self.items["end"][0]
 
     def fail(self, expected: str) -> InputError:
-        shown = self.text if len(self.text) <= 60 else self.text[:57] + "..."
-        found = f"found {shown!r}" if shown else "the file ends"
+        found = f"found {cut(self.text)!r}" if self.text else "the file ends"
         return InputError(f"{self.path}, line {self.number}: {found}, expected {expected}")
 
     def with_items(self, name: str, lines: Iterator[_Item]) -> _Item:

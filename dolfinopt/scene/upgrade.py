@@ -6,13 +6,14 @@ import copy
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import zip_longest
 from typing import Any
 
 from dolfinopt.data import tomllib
 from dolfinopt.errors import InputError
 from dolfinopt.scene.load import scene_from_dict
 from dolfinopt.scene.old_words import read_old_words
-from dolfinopt.scene.tables.base import toml_value
+from dolfinopt.scene.tables.base import rows, toml_value
 from dolfinopt.scene.text import read_toml
 
 HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z0-9_.-]+)\s*\]{1,2}\s*(#.*)?$")
@@ -43,17 +44,7 @@ def upgraded(source: str) -> tuple[str, list[str]]:
     new = copy.deepcopy(old)
     told = read_old_words(new, source)
     with open(source, encoding="utf-8-sig") as file:
-        blocks = _blocks(file.read())
-    for table, value in old.items():
-        own = [block for block in blocks if block.path == table]
-        after = new.get(table, [{}] * len(own))
-        pairs = zip(value, after) if isinstance(value, list) else [(value, after)]
-        for (row, other), block in zip(pairs, own):
-            if isinstance(row, Mapping) and row != other:
-                _rewrite(block, row, other if table in new else None)
-        gone = {f"{table}.{key}" for key in _keys(value) - _keys(new.get(table))}
-        blocks = [block for block in blocks if block.path not in gone]
-    blocks += _added(old, new)
+        blocks = _in_new_words(_blocks(file.read()), old, new)
     text = "".join(piece for block in blocks for _, piece in block.lines)
     try:
         same = scene_from_dict(tomllib.loads(text), source) == before
@@ -64,10 +55,22 @@ def upgraded(source: str) -> tuple[str, list[str]]:
     return text, list(before.old_words)
 
 
-def _keys(value: Any) -> set[str]:
-    """Return the keys of a table, or of all rows of an array of tables."""
-    rows = value if isinstance(value, list) else [value]
-    return {key for row in rows if isinstance(row, Mapping) for key in row}
+def _in_new_words(
+    blocks: list[Block], old: Mapping[str, Any], new: Mapping[str, Any]
+) -> list[Block]:
+    """Return a file's tables with the values of now; an inline table stays as it is."""
+    gone = set()
+    for table in {**old, **new}:
+        own = [block for block in blocks if block.path == table]
+        for row, other, block in zip_longest(rows(old, table), rows(new, table), own):
+            if row is None and other:  # what an older word became
+                header = f"[[{table}]]" if isinstance(new[table], list) else f"[{table}]"
+                block = Block(table, [("", f"\n{header}\n")])
+                blocks.append(block)
+            if row != other and block is not None:
+                gone |= {f"{table}.{key}" for key in row or () if key not in (other or ())}
+                _rewrite(block, row or {}, other)
+    return [block for block in blocks if block.path not in gone]
 
 
 def _rewrite(block: Block, row: Mapping[str, Any], other: Mapping[str, Any] | None) -> None:
@@ -84,18 +87,6 @@ def _rewrite(block: Block, row: Mapping[str, Any], other: Mapping[str, Any] | No
             name = key if key in other else fresh.pop(0)
             lines.append((name, f"{name} = {toml_value(other[name])}{_comment(text)}\n"))
     block.lines = [*lines[:1], *((k, f"{k} = {toml_value(other[k])}\n") for k in fresh), *lines[1:]]
-
-
-def _added(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[Block]:
-    """Return tables, and rows of arrays of them, that older ones became."""
-    result = []
-    for table, value in new.items():
-        rows = value[len(old.get(table, [])) :] if isinstance(value, list) else [value]
-        header = f"[[{table}]]" if isinstance(value, list) else f"[{table}]"
-        for row in rows if isinstance(value, list) or table not in old else []:
-            lines = [f"{key} = {toml_value(item)}" for key, item in row.items()]
-            result.append(Block(table, [("", "\n".join(["", header, *lines, ""]))]))
-    return result
 
 
 def _comment(text: str) -> str:

@@ -123,7 +123,7 @@ def test_an_own_mesh_has_the_size_of_cells_of_the_arm_before(tmp_path, file, tex
         (".msh", {"cell_shape": "triangle"}, [".msh", "says it itself"]),
         (".geo", {"mesh_size": 0.07}, ["at most height = 0.06 [m]"]),
         (".geo", {"cell_shape": "triangle", "element": "incompatible"},
-         ['= "incompatible"', '"linear" or "quadratic"', "triangles"]),
+         ['= "incompatible"', '"linear" or "quadratic"', '= "triangle"']),
     ],
 )  # fmt: skip
 def test_kinds_of_mesh_files(tmp_path, suffix, keys, words):

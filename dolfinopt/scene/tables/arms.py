@@ -408,7 +408,7 @@ class Arm(Drive):
                 "mesh",
             )
         if self.element == "incompatible" and self.cell_shape in SIMPLICES:
-            cells = "triangles" if self.cell_shape == "triangle" else "tetrahedra"
+            cells = f"cell_shape = {shown(self.cell_shape)}"
             raise Refusal(f'expected "linear" or "quadratic" with {cells}', "element", "cell_shape")
 
     @property
@@ -466,8 +466,7 @@ class Arm(Drive):
             return 2.0  # one layer of cells between two surfaces of nodes
         if element != "quadratic":
             return corners
-        more = {"tetrahedron": 8.0, "hexahedron": 8.0}
-        return more.get(self.shape, 4.0) * corners
+        return (8.0 if self.is_solid else 4.0) * corners
 
     @property
     def solid_ends(self) -> float:

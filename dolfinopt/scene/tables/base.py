@@ -276,6 +276,17 @@ def refuse_count(values: object, names: Sequence[str], at: str | Loc) -> None:
         raise Refusal(f"expected {number}, for {', '.join(names)}", at)
 
 
+def wrench(load: Any, dimension: int) -> tuple[float, ...]:
+    """Return force and moment that a table states, N and N m, zeros where it states none.
+
+    Two components and one in the plane, three each in space; another number as it is stated.
+    """
+    force, moment = load.force or (0.0,) * dimension, load.moment
+    if moment is None:
+        moment = (0.0,) * (2 * dimension - 3)
+    return *force, *(moment if isinstance(moment, tuple) else (moment,))
+
+
 def problem(error: ValidationError) -> str:
     """Return key and reason of the first problem of a table on its own."""
     first = error.errors(include_url=False)[0]

@@ -340,11 +340,6 @@ class Payload(Table):
     offset: Three[Position] = (0.0, 0.0, 0.0)
     arm: str | None = None
 
-    @property
-    def moment(self) -> float:
-        """Inertia of inertia in the plane, about z, kg m2."""
-        return self.inertia[2] if isinstance(self.inertia, tuple) else self.inertia
-
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse a tensor that no body has, and a place that no arm has."""
         if problem := tensor_problem(self.inertia):
@@ -377,16 +372,6 @@ class Force(Table):
     def check_table(self) -> None:
         if self.force is None and self.moment is None and self.table is None:
             raise Refusal("expected force, moment, or table = a file: nothing acts", "force")
-
-    def force_in(self, dimension: int) -> tuple[float, ...]:
-        """Return the constant force (d,), N."""
-        return (0.0,) * dimension if self.force is None else self.force
-
-    def moment_in(self, dimension: int) -> tuple[float, ...]:
-        """Return the constant moment (r,), N m."""
-        if self.moment is None:
-            return (0.0,) * (1 if dimension == 2 else 3)
-        return self.moment if isinstance(self.moment, tuple) else (self.moment,)
 
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse what acts nowhere, or a key that nothing uses."""

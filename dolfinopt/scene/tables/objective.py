@@ -112,8 +112,10 @@ class Objective(Table):
         self._check_attached(scene)
         count = 6 if scene.is_spatial else 3
         if any(len(load) != count for load in self.static_loads(scene)):
-            what = "six numbers, force and moment, with" if count == 6 else "three numbers without"
-            raise Refusal(f"expected arrays of {what} [[joints]]", "objective.loads")
+            raise Refusal(
+                "expected arrays of six numbers, force and moment, with [[joints]], else of three",
+                "objective.loads",
+            )
         self._check_load_cases(scene)
         self._check_lightest(scene)
         if not need_of(scene, "motion"):
@@ -181,12 +183,9 @@ class Objective(Table):
         """Refuse what the removal of all material makes least, unless something keeps it."""
         limited = not all(limited_by(key).lighter for key in scene.limits)
         if self.response.lighter and self.direction != "maximize" and not limited:
-            least = "the lightest design is an empty one"
-            if self.kind != "mass":
-                least = "the design that drives feel least is an empty one"
             raise Refusal(
-                f"expected a limit under [constraints] with it, for example deviation: without "
-                f"one {least}",
+                "expected a limit under [constraints] with it, for example deviation: without one "
+                "the best design is an empty one",
                 "objective.kind",
             )
 

@@ -21,6 +21,7 @@ from dolfinopt.scene.tables.base import (
     Table,
     Three,
     TwoOrThree,
+    wrench,
 )
 
 if TYPE_CHECKING:
@@ -49,17 +50,6 @@ class StiffnessCase(Table):
     displacement: Distance | None = None
     rotation: Angle | None = None
 
-    @property
-    def load(self) -> tuple[float, ...]:
-        """Force and moment, three components in the plane and six in space."""
-        force, moment = self.force, self.moment
-        spatial = isinstance(moment, tuple) or (force is not None and len(force) == 3)
-        none = 3 * (0.0,) if spatial else (0.0, 0.0)
-        turning = moment if isinstance(moment, tuple) else (moment or 0.0,)
-        if spatial and moment is None:
-            turning = none
-        return (*(force or none), *turning)
-
     def check_in_scene(self, scene: Scene) -> None:
         """Refuse what is no arm with a design, no load on it, or without limit."""
         names = [arm.name for arm in scene.arms if arm.flexible]
@@ -67,11 +57,15 @@ class StiffnessCase(Table):
             raise Refusal(f"expected the name of an arm with a design: {', '.join(names)}", ".arm")
         if self.displacement is None and self.rotation is None:
             raise Refusal("expected displacement or rotation, or both", "")
-        if not any(self.load):
+        load = wrench(self, scene.dimension)
+        if not any(load):
             raise Refusal("expected force or moment, not all of them zero", "")
-        if len(self.load) != (6 if scene.is_spatial else 3):
-            kind = "three components each" if scene.is_spatial else "two components and one number"
-            raise Refusal(f"expected force and moment of {kind} in this scene", "")
+        if len(load) != (6 if scene.is_spatial else 3):
+            raise Refusal(
+                "expected force and moment of three components each with [[joints]], else of two "
+                "components and one number",
+                "",
+            )
 
 
 Cases = tuple[StiffnessCase, ...]
@@ -99,7 +93,7 @@ class Limited:
     key: str = ""
     unit: str = ""
     lower: bool = False
-    options: tuple[str, ...] | None = None
+    options: Sequence[str] | None = None
     stated: bool = True
 
 
@@ -130,7 +124,7 @@ class Declaration:
     unit: str
     needs: frozenset[Need] = MOTION
     limit: Limited | None = None
-    options: tuple[str, ...] = ()
+    options: Sequence[str] = ()
     objective: bool = True
     stands_for: str = ""
     natural: Direction = "minimize"
@@ -157,7 +151,7 @@ class Declaration:
         return (self.limit.key or self.name) if self.limit else ""
 
     @property
-    def limit_options(self) -> tuple[str, ...]:
+    def limit_options(self) -> Sequence[str]:
         """Options that the limit uses."""
         own = self.limit.options if self.limit else ()
         return self.options if own is None else own
@@ -172,26 +166,20 @@ def _limited(
     *,
     range: Sequence[float] = (1e-15, 1e15),
     each: bool = False,
-    options: Sequence[str] | None = None,
     **words: Any,
 ) -> Limited:
     """Return the limit of a response, as responses.toml has it."""
     number: Any = Annotated[float, Field(ge=range[0], le=range[1])]
     kind = LIMIT_TYPES.get(name, number | tuple[number, ...] if each else number)
-    return Limited(type=kind, options=None if options is None else tuple(options), **words)
+    return Limited(type=kind, **words)
 
 
 def _declaration(name: str, entry: dict[str, Any]) -> Declaration:
     """Return what a scene says of a response, as responses.toml has it."""
-    limit = entry.pop("limit", None)
-    needs, options = entry.pop("needs", MOTION), entry.pop("options", ())
-    return Declaration(
-        name,
-        needs=frozenset(needs),
-        options=tuple(options),
-        limit=_limited(name, **limit) if limit else None,
-        **entry,
-    )
+    if limit := entry.get("limit"):
+        entry["limit"] = _limited(name, **limit)
+    entry["needs"] = frozenset(entry.get("needs", MOTION))
+    return Declaration(name, **entry)
 
 
 DECLARED = {
