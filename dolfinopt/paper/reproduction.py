@@ -70,7 +70,12 @@ Figures: TypeAlias = dict[int, tuple[Figure, LineFigure | Table]]  # with what h
 
 
 def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
-    """Return the paper's scene, `COARSE` if asked for, with "key.path=value" overridden."""
+    """Return the paper's scene.
+
+    Args:
+        coarse: with `COARSE` meshes and fewer iterations.
+        overrides: "key.path=value" each, as for --set.
+    """
     return load_scene(paper_scene(), (*LINEAR, *(COARSE if coarse else ()), *overrides))
 
 
@@ -156,7 +161,12 @@ def reproduce(plan: Plan, folder: Path, world: MPI.Comm) -> tuple[pd.DataFrame, 
 
 
 def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
-    """Return the table with what came out of its cases, see the module."""
+    """Return the table with what came out of its cases, see the module.
+
+    Args:
+        table: the plan's.
+        outcomes: of all its cases.
+    """
     result, made = ([outcomes[case] for case in table[name]] for name in ("case", "made"))
     results = table.assign(
         compliance=[item.compliance for item in result],
@@ -191,13 +201,21 @@ def _deviations_apart(outcome: Outcome, other: Outcome) -> float:
 
 
 def cross_values(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
-    """Return the quantity of designs made for i at value j (n, n), of one sweep's rows."""
+    """Return a quantity (n, n) of designs made for value i of a sweep, used at value j.
+
+    Args:
+        rows: of one sweep, with one scene at least for every value that a design was made for.
+        quantity: name of its column.
+    """
     made = rows.dropna(subset="made_for")
     return made.pivot(index="made_for", columns="x", values=quantity)[made.made_for.unique()]
 
 
 def loss(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
-    """Return the relative loss (n, n) of a design made for i against the one made for j, at j."""
+    """Return the relative loss (n, n) of a design made for i against the one made for j, at j.
+
+    With the value v_ij of the design made for i, used at j: v_ij / v_jj - 1.
+    """
     values = cross_values(rows, quantity)
     return values / np.diag(values) - 1.0
 
@@ -206,7 +224,16 @@ def loss(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
 
 
 def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
-    """Return figures 3 to 15 with their data; curves of cases that failed are missing."""
+    """Return figures 3 to 15 with their data; curves of cases that failed are missing.
+
+    3: deviation over time by objective. 4: the designs of all objectives.
+    5, 6: objective and grayness over the iterations, by reduction.
+    7: compliance against the number of coordinates, initial and optimised design.
+    8, 9: deviation over time by reduction: of the optimised design, and of designs made with it.
+    10, 11: compliance and deviation against the payload.
+    12, 13: the same against the flattening of the path.
+    14, 15: what a design made for one path loses on the others, of compliance and of deviation.
+    """
     results = results.assign(deviation=1e3 * results.deviation)
     results = results.rename(columns=dict(zip(("compliance", "deviation"), QUANTITIES)))
     by = dict(iter(results.groupby("table")))
@@ -315,7 +342,20 @@ TEXTS = ("name", "statement", "paper", "found", "criterion", "reason", "demand")
 
 @dataclass(frozen=True)
 class Check:
-    """One statement of the paper, see the table: it holds or not; the demand stands or not."""
+    """One statement of the paper, see statements.toml.
+
+    Attributes:
+        name: in few words.
+        statement: the paper's sentence.
+        paper: its number.
+        found: what is found here.
+        criterion: what the sentence comes to in figures.
+        reason: why it does not hold, "" where none is told.
+        demand: what `--check` asks for.
+        holds: whether the statement does.
+        stands: whether the demand does.
+        figures: of the paper.
+    """
 
     name: str
     statement: str
@@ -373,7 +413,21 @@ def percent(part: float) -> str:
 
 
 def quantities(results: pd.DataFrame) -> dict[str, Any]:
-    """Return everything that texts and criteria name; nan where a case failed."""
+    """Return everything that texts and criteria of statements.toml name; nan where a case failed.
+
+    Args:
+        results: rows as `add_outcomes` returns them.
+
+    Returns:
+        few_cms, many_cms: rows of the designs made with the fewest and the most coordinates of
+            Craig-Bampton, simulated in the reference.
+        few_modal, many_modal: the same of modal truncation.
+        cms_change: relative difference of the compliances of few_cms and many_cms.
+        before, after: what `_of_coordinates` says of the initial and of the optimised design.
+
+        And what is said of objectives, payloads and paths, see `_of_objectives`, `_of_payloads`
+        and `_of_paths`.
+    """
     by = dict(iter(results.groupby("table")))
     curves, reductions = by["coordinates"], by["reductions"].sort_values("x").astype({"x": int})
     cms, modal = (reductions[reductions.kind == method] for method in METHODS)
@@ -392,6 +446,17 @@ def quantities(results: pd.DataFrame) -> dict[str, Any]:
 
 
 def _of_objectives(rows: pd.DataFrame) -> dict[str, Any]:
+    """Return what designs for other objectives do in the motion.
+
+    Returns:
+        initial: largest deviation of the initial design, m.
+        dynamic: row of the design for the motion's equivalent static loads.
+        dynamic_is_far: whether its deviation is far below that of all others.
+        dynamic_is_best: whether its compliance is the least.
+        fourths: of how many kinds a design deviates by a fourth of the initial one.
+        ratios: deviation over the initial design's, by label.
+        best: row of the stiffest of the others.
+    """
     initial, dynamic = rows.iloc[0], rows[rows.kind == "esl"].iloc[0]
     others = rows[rows.kind.isin(["static", "eigenfrequency"])]
     ratios = others.deviation / initial.deviation
@@ -408,7 +473,17 @@ def _of_objectives(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _of_coordinates(rows: pd.DataFrame) -> dict[str, Any]:
-    """Return what one design's curves over the number of coordinates do."""
+    """Return what one design's curves over the number of coordinates do.
+
+    Returns:
+        level: compliance with the most coordinates of Craig-Bampton, N m.
+        flat: relative span of all these.
+        modal: compliance with the fewest and the most modes, N m.
+        climbs_below: whether modal truncation climbs towards Craig-Bampton, always below it.
+        counts: the fewest and the most modes.
+        apart: largest distance between the deviations of Craig-Bampton, relative.
+        below: share by which modal truncation falls short of the deviation, fewest and most modes.
+    """
     cms, modal = (rows[rows.kind == method] for method in METHODS)
     c, m = cms.compliance.to_numpy(), modal.compliance.to_numpy()
     climbs = (np.diff(m) >= -TOLERANCE["flat"] * m[-1]).all() and m[-1] > m[0]
@@ -424,6 +499,17 @@ def _of_coordinates(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _of_payloads(rows: pd.DataFrame) -> dict[str, Any]:
+    """Return what the payload does to designs.
+
+    Returns:
+        payloads: the least and the largest that are carried, kg.
+        made_for: the least and the largest that a design was made for, kg.
+        bend_deviation: largest distance of a deviation from a straight line, see `bend`.
+        bend: that of the compliance of the initial and of the nominal design.
+        power: exponent of both compliances over the payload, see `power`.
+        payload_differ: largest difference between the designs made for least and largest payload.
+        payload_loss: see `_losses`.
+    """
     x, designs = rows.x.unique(), dict(iter(rows.groupby("label")))
     made = rows.dropna(subset="made_for").pivot(index="made_for", columns="x", values="compliance")
     curves = designs[INITIAL].compliance, made.iloc[1]
@@ -439,6 +525,17 @@ def _of_payloads(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _of_paths(rows: pd.DataFrame) -> dict[str, Any]:
+    """Return what the path does to designs.
+
+    Returns:
+        change_initial, change_optimum: relative span of the compliance over the paths, of the
+            initial design and of the one made for the semicircle.
+        path: least and largest deviation of the design made for a path over the initial one's.
+        over_solid: the largest of the deviation over that of solid arms.
+        solid: deviation of solid arms on the semicircle, m.
+        solids: least and largest of their deviation over the initial design's.
+        path_loss: see `_losses`.
+    """
     designs = {label: item.set_index("x") for label, item in rows.groupby("label")}
     initial, solid = designs[INITIAL], designs[SOLID].deviation
     nominal = rows.dropna(subset="made_for").label.iloc[-1]
@@ -468,7 +565,10 @@ def span(values: Iterable[float]) -> float:
 
 
 def bend(x: Iterable[float], y: Iterable[float]) -> float:
-    """Return the largest distance from the straight line of best fit, relative to the mean."""
+    """Return the largest distance from the straight line of best fit, relative to the mean.
+
+    nan where a value is.
+    """
     x, y = np.array([*x]), np.array([*y])
     if not np.isfinite(y).all():
         return math.nan
