@@ -444,7 +444,7 @@ def test_two_ranks_write_the_same_solids(tmp_path, capfd):
     options = "--no-check", "--no-plots"
     run("part", folder, "--out", tmp_path / "one", *options)
     told = capfd.readouterr().out
-    assert "no STEP of link1:" in told and "column: no part" in told
+    assert "no STEP of link1:" in told and "no part of column:" in told
     done = shell("part", folder, "--out", tmp_path / "two", *options, ranks=2)
     assert done.returncode == 0, done.stderr
     here, there = (contents(tmp_path / name) for name in ("one", "two"))
