@@ -88,7 +88,7 @@ def parse_vary(text: str) -> Vary:
     if is_range:
         if count < 2 or start == stop:
             raise InputError(f"--vary {text}: expected at least two values between two ends")
-        numbers = np.linspace(start, stop, count).tolist()
+        numbers = list(map(float, np.linspace(start, stop, count)))
     return Vary(key.strip(), tuple(dict.fromkeys(numbers)), text)
 
 
