@@ -13,13 +13,12 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 from dolfinopt.errors import InputError
 from dolfinopt.exchange.urdf.file import read_robot
-from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints
 from dolfinopt.exchange.urdf.robot import Robot, scene_bodies
+from dolfinopt.exchange.urdf.scene import meshed
 
 
 def outcome(robot: Robot, name: str) -> list[str]:
@@ -28,17 +27,9 @@ def outcome(robot: Robot, name: str) -> list[str]:
         (body,) = (item for item in scene_bodies(robot, (name,), None) if item.is_solid)
     except InputError as error:
         return [str(error)]
-    link, said = robot.links[name], ""
-    for shapes in (link.shapes, link.visual() if link.visual else None):
-        try:
-            mesh = cells_between_joints(shapes, body) if shapes is not None else None
-        except NoSolid as error:
-            said = said or f"box: {error}"
-            continue
-        if mesh is not None:
-            own = replace(mesh, done=("visual geometry",) * bool(said) + mesh.done)
-            return ["in its own shape", *(own.done or ("as it is",))]
-    return [said]
+    said: list[str] = []
+    mesh = meshed(robot, body, said.extend).mesh
+    return said if mesh is None else ["in its own shape", *(mesh.done or ("as it is",))]
 
 
 def sentences(folder: Path) -> Iterator[str]:

@@ -422,12 +422,12 @@ def scene_of_robot(
     t, rows, said = read_trajectory(robot, trajectory, loops)
     warn([*said, *implausible_inertias(robot)])
     if not boxes:
-        bodies = tuple(_meshed(robot, body, warn) if body.is_solid else body for body in bodies)
+        bodies = tuple(meshed(robot, body, warn) if body.is_solid else body for body in bodies)
     start_joints = tuple(map(float, rows[0, : len(robot.movable)]))
     return RobotScene(robot, bodies, float(t[-1]), loops, start_joints), t, rows
 
 
-def _meshed(robot: Robot, body: SceneBody, warn: Warn) -> SceneBody:
+def meshed(robot: Robot, body: SceneBody, warn: Warn) -> SceneBody:
     """Return a solid in the shape of its link; a box, and a sentence, where it cannot be."""
     # The shape is that of the collision elements; of the visual ones where those are no solid.
     from dolfinopt.exchange.urdf.geometry import NoSolid, cells_between_joints  # loads trimesh
