@@ -10,8 +10,8 @@ from parts import frame
 
 from dolfinopt.errors import InputError
 from dolfinopt.part.part import Curves
-from dolfinopt.part.plane.curves import Arc, Line, Spline
-from dolfinopt.part.plane.limits import Limits, rounded_radii
+from dolfinopt.part.plane.curves import Arc, Line, Spline, angle_of
+from dolfinopt.part.plane.limits import Limits, rounded_radii, struts
 from dolfinopt.part.plane.part import make_part
 from dolfinopt.part.plane.sides import Circle, Corner, Loop, Side, Sides
 from dolfinopt.part.program import least_move, solve
@@ -114,6 +114,27 @@ def test_narrowest_member_and_gap_are_differentiated():
 
         expected = differences(sides, least)[0]
         np.testing.assert_allclose(slopes[np.argmax(values)], expected, atol=1e-5)
+
+
+def test_sides_of_a_strut_become_parallel():
+    """Not its ends, which are further apart than they are long; steeper sides are a wedge."""
+    for slope, pairs in ((0.06, 1), (0.2, 0)):
+        places = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.03], [0.0, 0.03 - 0.1 * slope]])
+        ways = np.roll(places, -1, axis=0) - places
+        blade = (Side(p + 0.5 * d, angle_of(d)) for p, d in zip(places, ways, strict=True))
+        sides = Sides((Loop(tuple(blade), corners(*places)),)).centred()
+        limits = replace(LIMITS, member=1e-3, arm=shapely.Point(0.0, 0.0).buffer(1.0))
+        limits = replace(limits, stays=shapely.Point())
+        assert len(struts(sides)[0]) == 2 * pairs
+        found, _ = limits.nearest(sides)
+        assert np.abs(struts(found)[2]).max(initial=0.0) < 1e-3
+        if pairs:
+
+            def rows(some, limits=limits):
+                return np.array([value for value, _ in limits._struts(some)])
+
+            _, slopes = zip(*limits._struts(sides), strict=True)
+            np.testing.assert_allclose(slopes, differences(sides, rows), atol=1e-8)
 
 
 def test_nearest_outline_keeps_the_limits_and_an_area():
