@@ -405,7 +405,8 @@ class Check:
         }
         # Twice the strain energy under the loads of the motion: what is stiffer has less.
         size = abs(change["compliance"])
-        stiff = "as stiff as" if size < 0.05 else f"{size:.2g} % {_word(change)} than"
+        word = "stiffer" if change["compliance"] < 0.0 else "softer"
+        stiff = "as stiff as" if size < 0.05 else f"{size:.2g} % {word} than"
         others = ", ".join(f"{k} {_percent(v)}" for k, v in change.items() if k != "compliance")
         return f"the part is {stiff} {name} ({others})"
 
@@ -514,10 +515,6 @@ class Check:
             },
         }
         return dict(finite(result))
-
-
-def _word(change: Mapping[str, float]) -> str:
-    return "stiffer" if change["compliance"] < 0.0 else "softer"
 
 
 def _ratio(value: float, other: float) -> float:

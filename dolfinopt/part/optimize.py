@@ -19,13 +19,13 @@ from dolfinopt.arms.arm import stiffening_of
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.part.check import Column, refined
 from dolfinopt.part.folder import Forms, Saved
-from dolfinopt.part.part import Curves, Meshes, mesh_parts
+from dolfinopt.part.part import Meshes, mesh_parts
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.plane.layouts import trusses_of
 from dolfinopt.part.plane.limits import limits_of_part
-from dolfinopt.part.plane.part import PlanePart, make_part
+from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.problem import Problem
-from dolfinopt.part.search import PRICE, Search
+from dolfinopt.part.search import Search
 from dolfinopt.part.solid.part import SolidPart
 from dolfinopt.responses.constraints import Limit
 from dolfinopt.responses.response import objective_of
@@ -35,10 +35,6 @@ if TYPE_CHECKING:
     from dolfinopt.part.part import Part
 
 REPAIRS = 3  # times that limits missed in the end are met by further steps
-# Times the design's volume that contours enclose with which a search may begin. Struts that are
-# grey break at the contour of the volume: a rod misses its stress by 295 % there and its search
-# ends outside the limit; with a tenth more it is 71 %, and the search ends within.
-MORE = (1.0, 1.1, 1.2)
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 
 Outlines = Mapping[int, FreeSides]
@@ -182,10 +178,10 @@ def optimize_parts(
                 outlines = {k: _free(scene, k, part) for k, part in trusses.items()}
             if starts:
                 tell(f"from {name}")
-            problem, earlier = Problem(scene, parts, {}), saved.get(number)
-            if not number and earlier is None:
-                outlines = _cheapest(problem, owned)
-            descent = Descent(problem, outlines, iterations, tell, number, kept, earlier)
+            earlier = saved.get(number)
+            descent = Descent(
+                Problem(scene, parts, {}), outlines, iterations, tell, number, kept, earlier
+            )
             result.append(descent.found(name))
         except (ConvergenceError, InputError) as error:  # the parts as they were remain
             tell(f"from {name}: {error}")
@@ -201,23 +197,8 @@ def optimize_parts(
     return Optimized(best, others, mesh_parts(best.parts), given.value, interrupted)
 
 
-def _cheapest(problem: Problem, parts: Mapping[int, Part]) -> Outlines:
-    """Return the sides of those contours of the densities that cost least with missed limits."""
-    result: list[tuple[float, Outlines]] = []
-    for more in MORE:
-        with suppress(ConvergenceError, InputError):
-            outlines = {k: _free(problem.scene, k, item, more) for k, item in parts.items()}
-            cost = problem.evaluated(outlines, {}).cost(PRICE)
-            if result and cost > result[-1][0]:
-                break
-            result.append((cost, outlines))
-    if not result:
-        raise ConvergenceError("the machine with the parts cannot be simulated")
-    return result[-1][1]
-
-
-def _free(scene: Scene, k: int, part: Part, more: float = 1.0) -> FreeSides:
-    """Return the sides of a part, or of a contour that encloses more."""
+def _free(scene: Scene, k: int, part: Part) -> FreeSides:
+    """Return the sides of a part."""
     # No thinner than arms that repeat it smaller allow.
     repeating = [scene.arms[j] for j, pattern in scene.patterns.items() if pattern == k]
     arm = scene.arms[k]
@@ -231,8 +212,6 @@ def _free(scene: Scene, k: int, part: Part, more: float = 1.0) -> FreeSides:
         )
     smallest, tool = min([1.0, *sizes]), flat.outline.tool_radius
     limits = limits_of_part(flat.domain, tool, scene.design.minimum_gap, smallest)
-    if more > 1.0:
-        flat = replace(make_part(flat.domain, Curves(tool), more), tolerance=flat.tolerance)
     free = FreeSides(flat, flat.sides, limits, part.domain if isinstance(part, SolidPart) else None)
     result = free.nearest()
     return free if result is None else result[0]

@@ -97,21 +97,9 @@ def make_parts(
         }
     designs = read_smooth_design(folder / "design.npz", scene, partition, meshes)
     with together(world):
-        mine: dict[int, Part | InputError] = {}
-        for k, mesh in meshes.items():
-            try:
-                mine[k] = _part_of(scene, k, mesh, designs[k], curves)
-            except InputError as error:
-                mine[k] = error
-    results: dict[int, Part | InputError] = {}
-    for pieces in world.gather(mine, root=0) or ():
-        results.update(pieces)
-    parts = {k: part for k in sorted(results) if not isinstance(part := results[k], InputError)}
-    with together(world):
-        if len(parts) < len(results):
-            failed = [str(part) for part in results.values() if isinstance(part, InputError)]
-            raise InputError("; ".join(failed))
-    return parts
+        mine = {k: _part_of(scene, k, meshes[k], designs[k], curves) for k in meshes}
+    gathered = world.gather(mine, root=0) or []
+    return dict(sorted(item for parts in gathered for item in parts.items()))
 
 
 def _check(folder: Path, curves: Curves) -> None:

@@ -15,7 +15,7 @@ from dolfinopt.part.check import STRESS, Simulated, simulate_parts
 from dolfinopt.part.mesh import PlateMesh
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.stress import HOT, CornerStress, OutlineStress
-from dolfinopt.responses.constraints import Limit, limits_of
+from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
 from dolfinopt.responses.evaluation import constraint_gradients, objective_gradient
 from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress import arm_loads, maxima, motions_of
@@ -75,11 +75,6 @@ class State:
         sign = -1.0 if objective_of(self.simulated.scene).turned else 1.0
         objective = sign * self.simulated.evaluation.objective
         return np.concatenate([[objective], self.smooth / held - 1.0, self.shares])
-
-    def cost(self, price: float) -> float:
-        """Return what is minimised and the price of missed limits, a multiple of its size."""
-        value, *limits = self.values
-        return float(value + price * abs(value) * np.maximum(limits, 0.0).sum())
 
     @property
     def excess(self) -> float:
@@ -238,7 +233,7 @@ class Problem:
         """Return the problem with limits that are tighter by what finer meshes miss."""
         # Lower limits count by their squares, as those of frequencies.
         tightened = {
-            item.name: self._factor(item) * (1.0 + item.excess) ** (2 if item.least else 1)
+            item.name: self._factor(item) * (1.0 + item.excess + EXCESS) ** (2 if item.least else 1)
             for item in missed
         }
         return replace(self, tightened={**self.tightened, **tightened})

@@ -45,9 +45,6 @@ DEAR, RESTORING, NEARBY = 50.0, 3, 0.1
 FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
 # Of the promised fall: what a step must bring, and what makes the next one shorter, or longer.
 ACCEPTED, POOR, GOOD = 0.05, 0.25, 0.6
-# Of the radius, after a step that is refused. With a half the lightest arms end at 1.016 or, of
-# gradients that differ in the last digits, 1.042 kg, with this at 1.007.
-REFUSED = 0.25
 WORSE = 3e-3  # relative merit that one side or hole less may cost, of n the root of n times that
 
 Tell = Callable[[str], None]
@@ -206,9 +203,7 @@ class Search:
                 self.radius *= 0.5
                 continue
             share = tried.fall / tried.promised
-            if share < ACCEPTED:
-                self.radius *= REFUSED
-            elif share < POOR or share > GOOD:
+            if share < POOR or share > GOOD:
                 self.radius = min(LARGEST_RADIUS, self.radius * (0.5 if share < POOR else 2.0))
             if share >= ACCEPTED:
                 self._take(state, tried, linear)

@@ -153,13 +153,12 @@ class Outline:
         return CHORD * self.domain.cell
 
 
-def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
+def draw_outline(domain: Domain, limits: Limits) -> Outline:
     """Find the outline whose area is the material's volume over the thickness.
 
     Args:
         domain: the arm.
         limits: of its part.
-        more: times that volume.
 
     Raises:
         InputError: the tool does not fit into the arm; the design is a checkerboard; no material
@@ -167,7 +166,7 @@ def draw_outline(domain: Domain, limits: Limits, more: float = 1.0) -> Outline:
     """
     import shapely
 
-    where, tool, volume = f"arm {domain.name!r}", limits.tool, more * domain.volume
+    where, tool, volume = f"arm {domain.name!r}", limits.tool, domain.volume
     if 2.0 * tool >= domain.height:
         raise InputError(
             f"--tool-radius = {tool:g} m: the tool is as wide as {where}, which is "

@@ -226,8 +226,8 @@ def shape_facets(shape: Shape, thickness: float, chord: float) -> np.ndarray:
         chord *= 0.25  # sides half as long
 
 
-def make_part(domain: Domain, curves: Curves = DEFAULTS, more: float = 1.0) -> PlanePart:
-    """Return the part of one arm that encloses so many times the volume of its densities."""
+def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
+    """Return the part of one arm that encloses the volume of its densities."""
     away = domain.cell if curves.tolerance is None else curves.tolerance
     if away > domain.cell:
         raise InputError(
@@ -237,8 +237,8 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS, more: float = 1.0) -> P
     tool = min(TOOL, SLIM * domain.height) if curves.tool_radius is None else curves.tool_radius
     fine = min(away, TOLERANCE, CELLS * domain.cell)
     limits = limits_of_part(domain, tool)
-    outline = draw_outline(domain, limits, more)
-    sides = fitted_sides(outline, limits, away, more * domain.volume)
+    outline = draw_outline(domain, limits)
+    sides = fitted_sides(outline, limits, away, domain.volume)
     if curves.rounds:
         sides = rounded_radii(sides, limits)
     return PlanePart(domain, outline, sides, fine)

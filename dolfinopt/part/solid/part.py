@@ -183,7 +183,6 @@ class SolidPart:
             "height": height,
             "thickness": thickness,
             "cell_shape": "tetrahedron",
-            "symmetric": False,
         }
 
     def files(self, name: str, title: str) -> Iterator[tuple[str, str | bytes]]:
@@ -230,9 +229,8 @@ def plate_part(domain: SolidDomain, flat: PlanePart) -> SolidPart:
     """Return the part of an arm whose design is the same over the thickness."""
     outline, t = flat.outline, flat.domain.thickness
     surface = _prism(flat.shape, t, 0.5 * flat.tolerance)
-    lost = t * outline.islands_area
-    far = flat.distance
-    return SolidPart(domain, surface, outline.level, far, outline.islands, lost, flat)
+    lost = outline.islands, t * outline.islands_area
+    return SolidPart(domain, surface, outline.level, flat.distance, *lost, flat)
 
 
 def _prism(shape: Shape, thickness: float, tolerance: float) -> Surface:

@@ -455,9 +455,8 @@ def check_surface(name: str, surface: Surface) -> None:
 
 FINE, NEAR = 1e-6, 1e-3  # of the level; relative difference of volumes that will do
 WHOLE = 1.0 - 1e-9  # of a mark that points between two marked nodes have, but for rounding
-FEW = (
-    20_000  # cells up to which they are halved for the isosurface; of finer ones nodes tell enough
-)
+# Cells up to which they are halved for the isosurface; of finer ones nodes tell enough.
+FEW = 20_000
 MARKS = ("own", "inboard", "outboard")
 FURTHER = "further "  # before the names of the marks of further interfaces
 
