@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 import shapely
-from mpi4py import MPI
 from parts import frame
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
-from dolfinopt.mesh.gmsh_session import gmsh_on_root
 from dolfinopt.part.domain import loops, recognise
 from dolfinopt.part.part import Curves
 from dolfinopt.part.plane.curves import (
@@ -142,45 +140,6 @@ def test_regions_stay_solid_and_void(design):
     polygon = shapely.Polygon(outer, holes)
     assert polygon.buffer(1e-8).covers(shapely.box(0.3, -0.02, 0.4, 0.01))
     assert not polygon.buffer(-1e-8).intersects(shapely.box(0.5, 0.02, 0.6, 0.03))
-
-
-def tapered(path):
-    """Write a bar that tapers from 60 to 40 mm, a boss of 80 mm at one end, and bores."""
-    with gmsh_on_root(MPI.COMM_SELF) as gmsh:
-        occ = gmsh.model.occ
-        corners = [(0.0, -0.03), (1.0, -0.02), (1.0, 0.02), (0.0, 0.03)]
-        points = [occ.addPoint(x, y, 0.0) for x, y in corners]
-        lines = [occ.addLine(points[k], points[(k + 1) % 4]) for k in range(4)]
-        bar = occ.addPlaneSurface([occ.addCurveLoop(lines)])
-        discs = [(2, occ.addDisk(x, 0, 0, r, r)) for x, r in ((0.0, 0.04), (1.0, 0.02))]
-        body, _ = occ.fuse([(2, bar)], discs)
-        tools = [(2, occ.addDisk(x, 0, 0, r, r)) for x, r in ((0.0, 0.015), (1.0, 0.008))]
-        occ.cut(body, tools)
-        occ.synchronize()
-        gmsh.option.setString("Geometry.OCCTargetUnit", "M")
-        gmsh.write(str(path))
-    return path
-
-
-@pytest.mark.slow
-def test_tapered_arm_with_a_boss_from_step(design, tmp_path):
-    path = tapered(tmp_path / "arm.step")
-
-    def density(x, y):
-        near = np.minimum(np.hypot(x, y) - 0.015, np.hypot(x - 1.0, y) - 0.008) < 0.01
-        return near | (np.abs(y) > 0.018 - 0.006 * x) | (np.abs(x - 0.5) < 0.03)
-
-    changes = [f"arms.0.mesh={path}", "arms.0.height=0.08", "arms.0.mesh_size=0.006"]
-    part = make_part(design(density, *changes, "arms.0.passive=0.006"), Curves(0.002))
-    check(part, holes=4)
-    assert part.shape.concave_radius > 0.98 * 0.002
-    circles = {p.label: p.curve for p in part.shape.pieces if p.label}
-    assert circles["inboard"].radius == pytest.approx(0.015, abs=1e-9)
-    assert circles["outboard"].radius == pytest.approx(0.008, abs=1e-9)
-    exact = [p.curve for p in part.shape.loops[0] if not p.free]
-    slopes = [np.subtract(*c.at(np.array([1.0, 0.0]))) for c in exact if isinstance(c, Line)]
-    assert [abs(y / x) for x, y in slopes] == pytest.approx([0.01] * len(slopes), abs=1e-6)
-    assert {round(c.radius, 8) for c in exact if isinstance(c, Arc)} >= {0.04, 0.02}
 
 
 def test_checkerboard_is_refused(design):

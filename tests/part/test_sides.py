@@ -123,8 +123,7 @@ def test_sides_of_a_strut_become_parallel():
         ways = np.roll(places, -1, axis=0) - places
         blade = (Side(p + 0.5 * d, angle_of(d)) for p, d in zip(places, ways, strict=True))
         sides = Sides((Loop(tuple(blade), corners(*places)),)).centred()
-        limits = replace(LIMITS, member=1e-3, arm=shapely.Point(0.0, 0.0).buffer(1.0))
-        limits = replace(limits, stays=shapely.Point())
+        limits = replace(LIMITS, member=1e-3, arm=shapely.box(-1, -1, 1, 1), stays=shapely.Point())
         assert len(struts(sides)[0]) == 2 * pairs
         found, _ = limits.nearest(sides)
         assert np.abs(struts(found)[2]).max(initial=0.0) < 1e-3
