@@ -154,15 +154,15 @@ class _Traits:
 
 def _gather_traits(run: RankResult) -> dict[int, _Traits]:
     """Return the traits of every design, on the root (collective)."""
-    partition, arms, x_phys, counts = run.partition, run.arms, run.x_phys, run.profile.counts
+    partition, counts = run.partition, run.profile.counts
     run.profile.counts = replace(counts)  # nothing of the result depends on what follows
     with together(partition.world):
-        mine = {k: _traits(run.scene, k, arm, x_phys[k]) for k, arm in arms.items()}
+        mine = {k: _traits(run.scene, k, arm, run.x_phys[k]) for k, arm in run.arms.items()}
     run.profile.counts = counts
     traits = gather_arms(partition, mine)
     if partition.world.bcast(is_grey(run.scene, _grayness(traits)), root=0):
         return traits
-    widths = _widths(partition, arms, x_phys)
+    widths = _widths(run.scene, partition, run.arms, run.x_phys)
     return {k: replace(item, widths=widths.get(k, item.widths)) for k, item in traits.items()}
 
 
@@ -313,18 +313,23 @@ def _all_warnings(
 
 
 def _cost(run: RankResult, wall: float) -> dict[str, Any]:
-    """Return seconds by phase, counts, memory and ranks, on the root (collective)."""
+    """Return seconds by phase, those of the slowest rank, counts, memory and number of ranks.
+
+    On the root, an empty dict elsewhere (collective).
+    """
     world = run.partition.world
-    every = world.allgather(dict(run.profile.seconds))  # of every rank; the slowest counts
-    phases = dict.fromkeys(phase for item in every for phase in item)
-    seconds = {phase: max(item.get(phase, 0.0) for item in every) for phase in phases}
-    own = (run.counts or run.profile.counts) if run.partition.is_root else Counts()
-    counted = world.gather(own, root=0)
-    memory = world.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0)
+    counts = (run.counts or run.profile.counts) if run.partition.is_root else Counts()
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    every = world.gather((dict(run.profile.seconds), counts, memory), root=0)
+    if every is None:
+        return {}
+    seconds, counted, memories = zip(*every, strict=True)
+    phases = dict.fromkeys(phase for own in seconds for phase in own)
+    slowest = {phase: max(own.get(phase, 0.0) for own in seconds) for phase in phases}
     return {
-        "seconds": {**seconds, "total": wall},
-        "counts": asdict(sum(counted or (), Counts())),
-        "peak_memory_mb": max(memory or [0.0]),
+        "seconds": {**slowest, "total": wall},
+        "counts": asdict(sum(counted, Counts())),
+        "peak_memory_mb": max(memories),
         "ranks": world.size,
     }
 
@@ -360,9 +365,6 @@ def _machine(trajectory: Trajectory) -> dict[str, Any]:
             name: {unit: float(size.max()) for unit, size in sizes.items()}
             for name, sizes in trajectory.closure_sizes.items()
         }
-    if trajectory.closure is not None:
-        (sizes,) = trajectory.closure_sizes.values()
-        result["closure_force_peak"] = float(sizes["N"].max())
     return result
 
 
@@ -409,35 +411,32 @@ def _units(trajectory: Trajectory) -> dict[str, Any]:
     if scene.closures:
         parts = {closure.name: closure.parts(scene.dimension) for closure in scene.closures}
         units["closure_peak"] = {name: {u: u for _, u in own} for name, own in parts.items()}
-        units |= {} if scene.is_spatial else {"closure_force_peak": "N"}
     units["history.csv"] = {"objective": unit, **UNITS["history"], "multipliers": unit}
     units["trajectory.csv"] = trajectory_units(trajectory)
     return units
 
 
 def _widths(
-    partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+    scene: Scene, partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> dict[int, Widths]:
     """Return the widths of member and gap of the designs cut at one half; on the root."""
     # Of solid arms where the scene asks for a width: voxels take seconds.
     mine: dict[int, dict[str, np.ndarray]] = {}
-    asked = {}
     with together(partition.world):
         for k, arm in arms.items():
-            mesh, design = arm.mesh, arm.scene.design
-            if mesh.dim == 3 and not design.controls_widths:
+            mesh = arm.mesh
+            if mesh.dim == 3 and not scene.design.controls_widths:
                 continue
             points = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
             table = {"corners": points, "solid": x_phys[k] > SOLID, "fixed": mesh.fixed}
-            if arm.scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
+            if scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
                 table["corners"] = points[:, :4, :2]
-                lowest = _lowest(mesh.comm, points[:, :4, 2], arm.scene.arms[k].thickness)
+                lowest = _lowest(mesh.comm, points[:, :4, 2], scene.arms[k].thickness)
                 table = {name: values[lowest] for name, values in table.items()}
             mine[k] = table
-            asked[k] = max(design.least_widths)
-    tables, asked = gather_tables(partition, mine), gather_arms(partition, asked)
+    tables, asked = gather_tables(partition, mine), max(scene.design.least_widths)
     with together(partition.world):
-        return {k: widths_of(**table, asked=asked[k]) for k, table in tables.items()}
+        return {k: widths_of(**table, asked=asked) for k, table in tables.items()}
 
 
 def _lowest(comm: MPI.Comm, z: np.ndarray, thickness: float) -> np.ndarray:

@@ -314,7 +314,6 @@ def test_links_of_files_that_cannot_be(folder, tmp_path):
     refusal(lambda: do.Model(scene), "bar.sid", "nelastq = 0", "rigid = true, mass")
     write_sid(tmp_path / "beam.sid", to_sid(in_space(beam().body())))
     scene = meshed()
-    scene = meshed()
     scene["arms"][2] = {"name": "link2", "sid": str(tmp_path / "beam.sid")}
     stiffening, plane = doubts_of_files(do.scene_from_dict(scene))
     assert "beam.sid" in stiffening and "geometric stiffness" in stiffening
