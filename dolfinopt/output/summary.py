@@ -24,10 +24,16 @@ from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
-from dolfinopt.output.feed_forward import comparison_of, lead_warnings, summary_of_feed_forward
+from dolfinopt.output.feed_forward import compared, lead_warnings, summary_of_feed_forward
 from dolfinopt.output.joint_limits import joint_limits
 from dolfinopt.output.torsion import torsion_warnings
-from dolfinopt.output.trajectory import UNITS, drive_units, free_drives, trajectory_units
+from dolfinopt.output.trajectory import (
+    UNITS,
+    by_drive,
+    drive_units,
+    free_drives,
+    trajectory_units,
+)
 from dolfinopt.parallel import Partition, gather_arms, gather_tables, together
 from dolfinopt.profiling import Counts
 from dolfinopt.responses.constraints import limits_of, summary_of
@@ -74,7 +80,7 @@ def summarise(
     """
     scene, partition, trajectory = run.scene, run.partition, run.trajectory
     cost = _cost(run, wall)  # without what follows
-    traits, comparison = _gather_traits(run), comparison_of(run)
+    traits, comparison = _gather_traits(run), compared(run)
     stiffening = stiffening_of(run.arms)
     with together(partition.world):
         if trajectory is None:  # this is not the root
@@ -84,7 +90,7 @@ def summarise(
             **_figures(run.evaluation),
             **_machine(trajectory),
             "loop_start": loop_start(scene),
-            "feed_forward": summary_of_feed_forward(trajectory, comparison),
+            "feed_forward": summary_of_feed_forward(trajectory, *comparison),
             "deflection_budget": budget_of(trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, trajectory, traits),
@@ -337,10 +343,6 @@ def _cost(run: RankResult, wall: float) -> dict[str, Any]:
 def _machine(trajectory: Trajectory) -> dict[str, Any]:
     """Return masses, drives and residual vibration; of machines control errors and reactions."""
     scene, bodies = trajectory.scene, trajectory.mechanism.arms
-
-    def by_drive(values: np.ndarray) -> dict[str, float]:
-        return dict(zip(scene.driven, map(float, values[scene.driven_columns]), strict=True))
-
     peak, rms = trajectory.drives
     pairs = zip(bodies, scene.owners, strict=True)
     result = {
@@ -348,8 +350,8 @@ def _machine(trajectory: Trajectory) -> dict[str, Any]:
         "settling": trajectory.settling,
         "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
         "designed_mass": float(sum(body.mass for body, owner in pairs if owner is not None)),
-        "drive_peak": by_drive(peak),
-        "drive_rms": by_drive(rms),
+        "drive_peak": by_drive(scene, peak),
+        "drive_rms": by_drive(scene, rms),
     }
     limits: dict[str, dict[str, Any]] = {}
     for limit in joint_limits(trajectory):
@@ -358,7 +360,7 @@ def _machine(trajectory: Trajectory) -> dict[str, Any]:
     if limits:
         result["joint_limits"] = limits
     if free := free_drives(scene):
-        errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
+        errors = by_drive(scene, np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
         result["drive_error_peak"] = {name: errors[name] for name in free}
     if trajectory.closure_sizes:
         result["closure_peak"] = {

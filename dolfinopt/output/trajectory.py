@@ -122,6 +122,11 @@ def drive_units(scene: Scene) -> dict[str, str]:
     return {name: FORCE_OF[units[name]] for name in scene.driven}
 
 
+def by_drive(scene: Scene, values: np.ndarray) -> dict[str, float]:
+    """Return those of the drives among values (n,) of all rigid coordinates, by their names."""
+    return dict(zip(scene.driven, map(float, values[scene.driven_columns]), strict=True))
+
+
 def free_drives(scene: Scene) -> tuple[str, ...]:
     """Return the driven coordinates that may leave the desired motion: control, or soft joints."""
     if scene.control is not None:
