@@ -159,7 +159,7 @@ def reproduce(
     overrides = (*(paper.FITTED if fitted else ()), *overrides)
     scene = on_root(world, paper.load_paper, coarse, overrides)
     plan = paper.Plan(scene)
-    results, outcomes = paper.reproduce(plan, folder, world)
+    results, outcomes = Runner(folder, world).follow(paper.reproduce(plan))
     checks = paper.check_paper(results)
 
     def conclude() -> None:

@@ -117,7 +117,7 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
 def summary_of_feed_forward(
     trajectory: Trajectory, plain: Trajectory | None, finer: float | None
 ) -> dict[str, Any] | None:
-    """Return what summary.json tells of a feed-forward, beside what `compared` has; None without."""
+    """Return what summary.json tells of a feed-forward, with what `compared` has; or None."""
     scene, feed_forward = trajectory.scene, trajectory.feed_forward
     if feed_forward is None:
         return None
