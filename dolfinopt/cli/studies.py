@@ -59,11 +59,11 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
 
         def conclude() -> None:
             remove_stale(folder, listed_files(folder / f"{name}.json"))
-            written = write_study(done, folder)
+            written = write_study(done, name, folder)
             if plots:
                 from dolfinopt.study.figures import draw_all
 
-                written += draw_all(done.files, folder)
+                written += draw_all(done.files(name), folder)
             _write_question(folder, name, asked, [path.name for path in written])
             click.echo(done.markdown())
             click.echo(f"{runner.computed} cases computed; tables and pictures in {folder}")

@@ -73,10 +73,10 @@ def study_motions(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps[
         searched = [design, Case(forward, "optimize", label=DESIGNED)]
         result = yield searched
         if result.failures:
-            return Study(NAME, (), (), result.failures)
+            return Study((), (), result.failures)
         files = [result[item].design for item in searched]
     rows = _motions(scene, files, folder / NAME)
-    return (yield from reported(NAME, rows, partial(report, scene=scene)))
+    return (yield from reported(rows, partial(report, scene=scene)))
 
 
 def machines(scene: Scene) -> dict[str, str]:

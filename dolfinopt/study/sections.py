@@ -298,7 +298,7 @@ def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps
     own = Case(scene, "simulate", design, DESIGN)
     first = (yield [own])[own]
     if first.failure:
-        return Study(NAME, (), (), tuple(first.failures))
+        return Study((), (), tuple(first.failures))
     kinds = KINDS[scene.dimension].items()
     every = [Members(scene, kind, section, folder) for kind, section in kinds]
     asked: list[tuple[Members, str, Shares]] = []
@@ -312,7 +312,7 @@ def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps
         sizes = f"{members.section.named}: {members.sizes(shares)}"
         labels = {"section": members.kind, "made": sizing, "sizes [mm]": sizes}
         rows.append((labels, members.case(shares)))
-    study = yield from reported(NAME, rows, partial(report, scene=scene))
+    study = yield from reported(rows, partial(report, scene=scene))
     # A member that is too soft to be simulated is a finding, in its row, and no failure.
     return replace(study, failures=())
 

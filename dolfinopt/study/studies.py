@@ -101,8 +101,7 @@ def study(
             asked.insert(0, own)
         if not asked:
             raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
-        name = sweep_name(preset, vary)
-        return (yield from sweep_steps(scene, name, asked, designs, reoptimize))
+        return (yield from sweep_steps(scene, asked, designs, reoptimize))
     command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
     if others := [item.text for item in asked if preset == "objective" or item.key != COORDINATES]:
         only = "none" if preset == "objective" else f"only {COORDINATES}"
@@ -119,11 +118,10 @@ def study(
     return (yield from coordinates_steps(scene, designs, counts))
 
 
-def reported(name: str, rows: Rows, report: Callable[[pd.DataFrame], Report]) -> Steps[Study]:
+def reported(rows: Rows, report: Callable[[pd.DataFrame], Report]) -> Steps[Study]:
     """Return the steps of a study that asks for all its cases at once.
 
     Args:
-        name: of its files.
         rows: labels by column, and the case of each.
         report: tables and figures of the frame of all rows: labels, and `results_of` the case.
     """
@@ -135,7 +133,7 @@ def reported(name: str, rows: Rows, report: Callable[[pd.DataFrame], Report]) ->
     tables, figures = report(
         pd.DataFrame({**labels, **results_of(outcomes[case])} for labels, case in rows)
     )
-    return Study(name, tuple(tables), tuple(figures), outcomes.failures)
+    return Study(tuple(tables), tuple(figures), outcomes.failures)
 
 
 def results_of(outcome: Outcome) -> dict[str, Any]:
@@ -268,7 +266,7 @@ def magnitudes(
 
 
 def sweep_steps(
-    scene: Scene, name: str, asked: Sequence[Vary], designs: Sequence[Path], reoptimize: bool
+    scene: Scene, asked: Sequence[Vary], designs: Sequence[Path], reoptimize: bool
 ) -> Steps[Study]:
     """Return the steps of one key, two in a grid, or more, each alone.
 
@@ -291,13 +289,13 @@ def sweep_steps(
     grids = [asked] if len(asked) <= 2 else [[entry] for entry in asked]
     rows = [row for keys in grids for row in _sweep(scene, keys, given, reoptimize, not resized)]
     if len(grids) == 1:
-        return reported(name, rows, partial(_sweep_report, keys=tuple(asked)))
+        return reported(rows, partial(_sweep_report, keys=tuple(asked)))
     rows += [
         ({"role": "base", "design": label},
          Case(scene, "simulate", design, f"{label}, as it is"))
         for label, design in given.items()
     ]  # fmt: skip
-    return reported(name, rows, partial(_several, keys=tuple(asked)))
+    return reported(rows, partial(_several, keys=tuple(asked)))
 
 
 def _sweep(
@@ -440,7 +438,7 @@ def objective_steps(scene: Scene, kinds: Sequence[str] = ()) -> Steps[Study]:
         except InputError:  # the scene excludes it, as passive ends do "nothing attached"
             continue
     report = partial(_objectives, weights=scene.objective.effort_weights)
-    return reported("objective", [({}, case) for case in cases], report)
+    return reported([({}, case) for case in cases], report)
 
 
 def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
@@ -472,7 +470,7 @@ def coordinates_steps(
     for (label, design), other in product(given_designs(scene, designs).items(), scenes):
         case = Case(other, "simulate", design, f"{label}, {reduction_name(other)}")
         rows.append(({"design": label, **_reduction(other)}, case))
-    return reported("coordinates", rows, _coordinates)
+    return reported(rows, _coordinates)
 
 
 def _reduction(scene: Scene) -> dict[str, Any]:
@@ -501,7 +499,7 @@ def reduction_steps(scene: Scene, counts: Sequence[int] | None) -> Steps[Study]:
         again = Case(reference, "simulate", optimised, f"{optimised.label} in {called}")
         rows += [(_reduction(other) | {"role": "own"}, optimised)]
         rows += [(_reduction(other) | {"role": "again"}, again)]
-    return reported("reduction", rows, partial(_reductions, called=called))
+    return reported(rows, partial(_reductions, called=called))
 
 
 def _reductions(frame: pd.DataFrame, called: str) -> Report:

@@ -353,7 +353,7 @@ def study_random(
         for case in sample_cases(nominal, texts, label, design)
     ]
     report = partial(_report, inputs=inputs, values=values)
-    return (yield from reported(random_name(random), rows, report))
+    return (yield from reported(rows, report))
 
 
 def random_name(random: Sequence[str]) -> str:
