@@ -59,7 +59,7 @@ class Taylor:
 
     Attributes:
         M0: (nrow, ncol).
-        M1: (nrow, nq, ncol), zero for order 0; files of order 0 may have nq = 0.
+        M1: (nrow, nq, ncol), zero for order 0.
         order: 0 or 1.
         structure: of M0: 0 zero, 1 diagonal, 2 symmetric, 3 general, 4 unit matrix.
         nqn: dimension of higher orders, which are not read; zero.
@@ -73,12 +73,12 @@ class Taylor:
 
     def at(self, q: np.ndarray) -> np.ndarray:
         """Return M(q) (nrow, ncol)."""
-        if self.order == 0:
-            return self.M0
         return self.M0 + np.einsum("rkc,k->rc", self.M1, q)
 
 
-def taylor(M0: np.ndarray, M1: np.ndarray | None = None, *, nq: int, structure: int) -> Taylor:
+def taylor(
+    nq: int, M0: np.ndarray, M1: np.ndarray | None = None, structure: int = GENERAL
+) -> Taylor:
     """Return the expansion of order 0, or of order 1 where M1 (nrow, nq, ncol) is given.
 
     A structure that M0 does not have is replaced: one that is zero is called so.
@@ -346,7 +346,7 @@ def _taylor(block: _Item, name: str, nq: int) -> Taylor:
     if count != nq and (order > 0 or count != 0):
         raise block.end.fail(f"nq = {nq} of {name}, not {count}")
     M0 = np.zeros(shape)
-    M1 = np.zeros((shape[0], count, shape[1]))
+    M1 = np.zeros((shape[0], nq, shape[1]))
     first, second = block.entries("m0", M0.shape), block.entries("m1", M1.shape)
     if second and order == 0:
         raise block.end.fail(f"no m1 in {name}, which is of order 0")

@@ -88,16 +88,11 @@ class Distribution:
         return np.clip(self.law.ppf(first + shares * (last - first)), self.low, self.high)
 
     @property
-    def mean(self) -> float:
-        """Its expectation."""
+    def moments(self) -> tuple[float, float]:
+        """Its expectation and standard deviation."""
         x, weights = self._quadrature
-        return float(weights @ x)
-
-    @property
-    def deviation(self) -> float:
-        """Its standard deviation."""
-        x, weights = self._quadrature
-        return float(np.sqrt(weights @ (x - self.mean) ** 2))
+        mean = weights @ x
+        return float(mean), float(np.sqrt(weights @ (x - mean) ** 2))
 
     @cached_property
     def _quadrature(self) -> tuple[np.ndarray, np.ndarray]:
@@ -241,10 +236,7 @@ def polynomial_indices(
         return Indices(none, none, 0, 0.0)
     degrees = [p for p in range(1, MAX_DEGREE + 1)
                if math.comb(dimensions + p, p) <= n / SAMPLES_A_TERM] or [1]  # fmt: skip
-    single = [
-        distribution.polynomials(samples[:, i], degrees[-1])
-        for i, distribution in enumerate(distributions)
-    ]
+    single = [law.polynomials(x, degrees[-1]) for law, x in zip(distributions, samples.T)]
     fits = []
     for degree in degrees:
         chosen = combinations_with_replacement(range(dimensions + 1), degree)  # the last is 1
@@ -476,7 +468,7 @@ def _input_table(inputs: Sequence[Input]) -> Table:
     for item in inputs:
         law = item.distribution
         cut = round(100.0 * law.cut_off, 6)
-        rows.append((item.axis, law.text, item.nominal, law.mean, law.deviation, cut))
+        rows.append((item.axis, law.text, item.nominal, *law.moments, cut))
     columns = "input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]"
     title = "Random values, independent of one another, cut off where the key's range ends."
     return Table("inputs", title, pd.DataFrame(rows, columns=columns))

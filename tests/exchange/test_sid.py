@@ -173,7 +173,7 @@ def test_what_other_programs_write(tmp_path):
     lines = bar().splitlines()
     lines[lines.index("nq = 2", lines.index("Ge"))] = "nq = 0"
     data = read(tmp_path, "\n".join(lines))
-    assert data.Ge.M1.shape == (2, 0, 6)
+    assert data.Ge.M1.shape == (2, 2, 6)
     write_sid(tmp_path / "b.sid", data)
     assert bits(read_sid(tmp_path / "b.sid")) == bits(data)
     numbers = {"1.5": 1.5, "-.5d0": -0.5, "+2E1": 20.0, "4": 4.0, "1.0-100": 1e-100}
