@@ -23,7 +23,7 @@ from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_tables, on_root, together
 from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.schema import DIGEST, flattened, program, with_digests
+from dolfinopt.scene.schema import DIGEST, flattened, program, scene_content
 from dolfinopt.solver import user_options
 
 if TYPE_CHECKING:
@@ -44,14 +44,13 @@ MAKERS = "ndarray", "dtype", "_reconstruct", "_frombuffer", "scalar"  # of NumPy
 MAY_CHANGE = {
     *(f"optimizer.{key}" for key in ("max_iterations", "tolerance", "kkt_tolerance")),
     "objective.gradient",
+    "name",  # which earlier versions kept
 }
 
 
 def _scene_text(scene: Scene) -> str:
     """Return the scene as JSON; its files by their content, so that a project can be moved."""
-    data = with_digests(scene.to_dict())
-    del data["part"]  # which comes after the run
-    return json.dumps(data, sort_keys=True)
+    return json.dumps(scene_content(scene), sort_keys=True)
 
 
 def begin(folder: Path, scene: Scene) -> None:

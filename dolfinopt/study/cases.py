@@ -47,7 +47,7 @@ from dolfinopt.progress import log
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.responses.response import bodies_in
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.schema import file_digest, program, with_digests
+from dolfinopt.scene.schema import file_digest, program, scene_content
 from dolfinopt.study import variants
 
 Action = Literal["optimize", "simulate", "sample"]
@@ -207,13 +207,6 @@ def _advance(steps: Steps[T], outcomes: Outcomes) -> tuple[Sequence[Case] | None
         return steps.send(outcomes), None
     except StopIteration as stop:
         return None, stop.value
-
-
-def scene_content(scene: Scene, but: frozenset[str] = frozenset()) -> dict[str, Any]:
-    """Return what a scene computes with: its values and its files' content, `but` some tables."""
-    data = with_digests(scene.to_dict())
-    without = {"name", "part", *but}
-    return {table: value for table, value in data.items() if table not in without}
 
 
 def _digest(content: Any) -> str:
@@ -471,7 +464,7 @@ def _do(job: Job, place: _Place) -> None:
 
 def _optimise(case: Case, place: _Place) -> None:
     """Optimise, from the checkpoint of an interrupted run if there is one."""
-    begun, folder, scene = time.perf_counter(), place[case], _unnamed(case)
+    begun, folder, scene = time.perf_counter(), place[case], case.scene
     resume = True
     try:
         checkpoint.check(folder, scene)
@@ -489,7 +482,7 @@ def _optimise(case: Case, place: _Place) -> None:
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:
     """Simulate one design in many scenes."""
-    results = simulate_scenarios([_unnamed(case) for case in job], design)
+    results = simulate_scenarios([case.scene for case in job], design)
     for case in job:
         place.check()
         begun = time.perf_counter()
@@ -540,9 +533,4 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
             folder, wall = place[case], time.perf_counter() - begun
             make_folder(folder)
             more = {"seconds": {"total": wall}, "versions": versions(), "scene": scene.to_dict()}
-            write_summary(folder, {"name": case.key, "samples": samples, **more})
-
-
-def _unnamed(case: Case) -> Scene:
-    """Return the scene under the case's key, so that a checkpoint does not depend on a name."""
-    return case.scene.unchecked_copy({"name": case.key})
+            write_summary(folder, {"name": scene.name, "samples": samples, **more})
