@@ -6,6 +6,7 @@ The tree is the scene as read, before it is validated: values of any type may st
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
@@ -44,14 +45,14 @@ def _elbow(tree: Tree) -> Any:
     return 1 if tree.get("closures") and not tree.get("joints") else UNKNOWN
 
 
-def _joint_height(tree: Tree) -> Any:
+def _by_reach(share: float, tree: Tree) -> Any:
+    """Return a share of the length of all arms in the plane."""
     lengths = _sizes(tree, "length")
-    return SHOULDER * sum(lengths) if lengths and not tree.get("joints") else UNKNOWN
+    return share * sum(lengths) if lengths and not tree.get("joints") else UNKNOWN
 
 
 def _radius(tree: Tree) -> Any:
-    lengths = _sizes(tree, "length") if tree["motion"].get("path") == "arc" else []
-    return ARC * sum(lengths) if lengths and not tree.get("joints") else UNKNOWN
+    return _by_reach(ARC, tree) if tree["motion"].get("path") == "arc" else UNKNOWN
 
 
 def _filter_radius(tree: Tree) -> Any:
@@ -123,7 +124,7 @@ def _gradient(tree: Tree) -> Any:
 # In this order: the least duration of a path is known by its lengths.
 RULES: Mapping[tuple[str, str], Callable[[Tree], Any]] = {
     ("motion", "elbow"): _elbow,
-    ("motion", "joint_height"): _joint_height,
+    ("motion", "joint_height"): partial(_by_reach, SHOULDER),
     ("motion", "radius"): _radius,
     ("design", "filter_radius"): _filter_radius,
     ("motion", "duration"): _duration,
