@@ -17,7 +17,7 @@ from dolfinopt.dynamics.feed_forward import FeedForward, internal_rates
 from dolfinopt.errors import ConvergenceError
 from dolfinopt.output.design import Designed
 from dolfinopt.output.trajectory import UNITS, by_drive, drive_units
-from dolfinopt.parallel import gather_arms, together
+from dolfinopt.parallel import together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.csv_table import BESIDE_JOINTS
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -85,13 +85,10 @@ def simulated_with(design: Designed, held: FeedForward | None = None) -> Traject
 
     None elsewhere, and where it is not solved. The arms keep what they have.
     """
-    scene, partition, arms, x_phys = design
-    with together(partition.world):
-        bodies = {k: arm.under(scene).reduce(x_phys[k]) for k, arm in arms.items()}
-    owned = gather_arms(partition, bodies)
-    with together(partition.world), suppress(ConvergenceError):
-        if partition.world.rank == 0:
-            return simulate(scene, chain_of(scene, owned), Profile(), feed_forward=held)
+    scene, world, bodies = design.scene, design.partition.world, design.bodies()
+    with together(world), suppress(ConvergenceError):
+        if world.rank == 0:
+            return simulate(scene, chain_of(scene, bodies), Profile(), feed_forward=held)
     return None
 
 

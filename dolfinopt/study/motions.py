@@ -100,8 +100,8 @@ def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> Rows
     finer = finer_deviation(place, None) if rigid.reduction.count else None
     labels = {LONGER: 0.0, FINER: 1e3 * (finer or math.nan)}
     rows: Rows = [(labels, Case(rigid, "simulate", first, RIGID))]
-    bodies = {index: arm.reduce(place.x_phys[index]) for index, arm in place.arms.items()}
-    frequency, damping_ratio = build_system(rigid, chain_of(rigid, bodies)).slowest_vibration(2)
+    chain = chain_of(rigid, place.bodies())
+    frequency, damping_ratio = build_system(rigid, chain).slowest_vibration(2)
     if frequency > 0.0 and scene.motion.table_ends == "rest":
         for kind, label in SHAPERS.items():
             shaper = input_shaper(kind, frequency, damping_ratio)
