@@ -86,9 +86,10 @@ def save(
     with together(partition.world):
         own = {k: _of_arm(arm, k, memory) for k, arm in arms.items()}
     tables = gather_tables(partition, own)
-    with together(partition.world):
-        if partition.world.rank == 0:
-            _sealed(folder, {**_stamp(scene), "memory": _packed(memory, tables)})
+    on_root(
+        partition.world,
+        lambda: _sealed(folder, {**_stamp(scene), "memory": _packed(memory, tables)}),
+    )
 
 
 def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:

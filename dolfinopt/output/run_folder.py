@@ -145,9 +145,7 @@ class FolderRecorder:
 
     def begin(self, rows: Sequence[HistoryRow]) -> None:
         """Write the history anew with the rows known so far (collective)."""
-        with together(self.partition.world):
-            if self.partition.world.rank == 0:
-                write_history(self.folder / HISTORY, rows)
+        on_root(self.partition.world, write_history, self.folder / HISTORY, rows)
 
     def append(self, row: HistoryRow) -> None:
         """Add a line to the history (root only)."""

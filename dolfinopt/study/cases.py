@@ -21,7 +21,7 @@ import shutil
 import time
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -296,8 +296,6 @@ SUMMARY, TRAJECTORY = "summary.json", "trajectory.npz"
 DEVIATION = "deviation.npz"  # t and deviation of a simulation whose other files are not kept
 IDLE = 0.02  # s between two looks for a job
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
-FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason", "samples", "failure",
-           "failures")  # fmt: skip
 
 Job = Sequence[Case]  # of the same arms and design, which one rank builds once
 
@@ -339,7 +337,7 @@ class _Place:
         failed = self._failure(case)
         path = failed if failed.exists() else self[case] / SUMMARY
         data = json.loads(path.read_text("utf-8"))
-        known = {name: data[name] for name in FIGURES if name in data}
+        known = {item.name: data[item.name] for item in fields(Outcome) if item.name in data}
         known["seconds"] = data.get("seconds", {}).get("total", math.nan)
         return Outcome(case, self[case], **known, summary=data)
 
