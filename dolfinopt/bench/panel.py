@@ -86,5 +86,5 @@ def figure_of(diagram: Diagram, frame: Frame) -> LineFigure:
         for y in diagram.y:
             result = curves(part, diagram.x, y, diagram.by)
             lines = [Line(name, *points.to_numpy().T) for name, points in result.items()]
-            panels.append(Panel(title, diagram.x, y, tuple(lines), log=True))
-    return LineFigure(diagram.name, diagram.title, tuple(panels))
+            panels.append(Panel(title, diagram.x, y, lines, log=True))
+    return LineFigure(diagram.name, diagram.title, panels)

@@ -231,7 +231,7 @@ def write_gradient(
             order, name = canonical_order(table["centroid"]), scene.arms[index].name
             arrays |= {f"{name}/{key}": values[order] for key, values in table.items()}
         unit = scene.objective.response.unit  # per physical density, which has none
-        arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
+        arrays["units"] = [f"objective: {unit}", "centroid: m", f"gradient: {unit}"]
         write_arrays(path, arrays)
 
 

@@ -254,10 +254,10 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     shown = [good(objectives.case[objectives.label.isin(n)]) for n in ((INITIAL, SHOWN[0]), SHOWN)]
     with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
     axes = "elastic coordinates of each arm [-]", QUANTITIES[0]
-    by_count = tuple(
+    by_count = [
         Panel(label, *axes, studies.lines_by(item, "kind", "x", axes[1]), x_log2=True)
         for label, item in coordinates.astype({"x": int}).groupby("label", sort=False)
-    )
+    ]
     lines = [
         _over_time("Deviation of the end-effector by objective", *shown),
         *_convergence(good(reductions.made)),
@@ -283,7 +283,7 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
 def _over_time(title: str, *groups: Sequence[Outcome]) -> LineFigure:
     """Return deviations over time; empty axes where nothing could be simulated."""
     panels = [panel for outcomes in groups for panel in studies.deviation_panels(outcomes)]
-    return LineFigure("", title, tuple(panels) or (Panel("", "time [s]", "deviation [mm]", ()),))
+    return LineFigure("", title, panels or [Panel("", "time [s]", "deviation [mm]", ())])
 
 
 def _convergence(outcomes: Sequence[Outcome]) -> Iterator[LineFigure]:
@@ -298,14 +298,14 @@ def _convergence(outcomes: Sequence[Outcome]) -> Iterator[LineFigure]:
             lines.append(Line(item.case.label, np.array(x), np.array(y)))
         seen = key == "objective"
         title = "as the own model sees it" * seen
-        panel = Panel(title, "iteration [-]", label, tuple(lines), y_log=seen or None)
-        yield LineFigure("", f"Convergence of the {what} by reduction", (panel,))
+        panel = Panel(title, "iteration [-]", label, lines, y_log=seen or None)
+        yield LineFigure("", f"Convergence of the {what} by reduction", [panel])
 
 
 def _sweep(rows: pd.DataFrame, name: str, quantity: str) -> LineFigure:
     """Return a quantity over the swept value; the initial design has a scale of its own."""
     axis, lines = SWEEPS[name][1], studies.lines_by(rows, "label", "x", quantity)
-    panels = tuple(Panel("", axis, quantity, group) for group in (lines[:1], lines[1:]))
+    panels = [Panel("", axis, quantity, group) for group in (lines[:1], lines[1:])]
     what, by = (text.partition(" [")[0] for text in (quantity, axis))
     return LineFigure("", f"{what.capitalize()} against {by}", panels)
 

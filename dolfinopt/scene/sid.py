@@ -198,25 +198,25 @@ HEADER = ("order", "nrow", "ncol", "nq", "nqn", "structure")
 # -- named arrays, and the .npz file of them ---------------------------------------------------
 
 
-def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
-    """Return the data as named arrays, for an .npz file.
+def sid_arrays(data: StandardInputData) -> dict[str, Any]:
+    """Return the data as named arrays, numbers and texts, for an .npz file.
 
     `mass`, `names`, `comment`, `node_names`, `node_rframes`; of every matrix `Ct/M0` (nrow, ncol),
     `Ct/M1` (nrow, nq, ncol), `Ct/order`, `Ct/structure`, `Ct/nqn`; of a node's `node1/phi/M0`.
     """
     arrays = {
-        "mass": np.array(data.mass),
-        "names": np.array(data.names, dtype=str),
-        "comment": np.array(data.comment, dtype=str),
-        "node_names": np.array([node.name for node in data.nodes], dtype=str),
-        "node_rframes": np.array([node.rframe for node in data.nodes], dtype=str),
+        "mass": data.mass,
+        "names": data.names,
+        "comment": data.comment,
+        "node_names": [node.name for node in data.nodes],
+        "node_rframes": [node.rframe for node in data.nodes],
     }
     matrices = {name: getattr(data, name) for name in BODY}
     for k, node in enumerate(data.nodes, 1):
         matrices |= {f"node{k}/{name}": getattr(node, name) for name in NODE}
     for name, matrix in matrices.items():
         if matrix is not None:
-            arrays |= {f"{name}/{key}": np.asarray(value) for key, value in vars(matrix).items()}
+            arrays |= {f"{name}/{key}": value for key, value in vars(matrix).items()}
     return arrays
 
 

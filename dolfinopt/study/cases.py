@@ -167,9 +167,9 @@ class Outcomes:
         return replace(self.by_case[case], case=case)
 
     @property
-    def failures(self) -> tuple[str, ...]:
+    def failures(self) -> list[str]:
         """What failed, a line each."""
-        return tuple(line for outcome in self.by_case.values() for line in outcome.failures)
+        return [line for outcome in self.by_case.values() for line in outcome.failures]
 
 
 T = TypeVar("T")

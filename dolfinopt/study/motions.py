@@ -153,7 +153,7 @@ def report(frame: pd.DataFrame, scene: Scene) -> Report:
         "", f"{_verdict(able)} {NOTE}", with_failures(frame, frame[columns].join(further))
     )
     title = "Deviation of the tip from the path of each motion"
-    return [table], [LineFigure("deviation", title, tuple(deviation_panels(able)))]
+    return [table], [LineFigure("deviation", title, deviation_panels(able))]
 
 
 def _finer(outcome: Outcome) -> float:

@@ -297,7 +297,7 @@ def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps
     own = Case(scene, "simulate", design, DESIGN)
     first = (yield [own])[own]
     if first.failure:
-        return Study((), (), tuple(first.failures))
+        return Study((), (), first.failures)
     kinds = KINDS[scene.dimension].items()
     every = [Members(scene, kind, section, folder) for kind, section in kinds]
     asked: list[tuple[Members, str, Shares]] = []
@@ -410,7 +410,7 @@ def report(frame: pd.DataFrame, scene: Scene) -> Report:
     ]
     title = "Deviation with straight members and with the design"
     table = Table("", verdict(scene, frame), with_failures(frame, known[columns].join(limits)))
-    return [table], [LineFigure("deviation", title, tuple(deviation_panels(named)))]
+    return [table], [LineFigure("deviation", title, deviation_panels(named))]
 
 
 def verdict(scene: Scene, frame: pd.DataFrame) -> str:

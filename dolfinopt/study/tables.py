@@ -6,6 +6,7 @@ import base64
 import hashlib
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -63,7 +64,7 @@ class LineFigure:
 
     name: str
     title: str
-    panels: tuple[Panel, ...]
+    panels: Sequence[Panel]
 
     def csv(self) -> str:
         """Return all curves: a row a point."""
@@ -83,7 +84,7 @@ class DesignFigure:
 
     name: str
     title: str
-    designs: tuple[tuple[str, Scene, Path], ...]
+    designs: Sequence[tuple[str, Scene, Path]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +107,9 @@ Figure = LineFigure | DesignFigure | FrameFigure
 class Study:
     """What a study found."""
 
-    tables: tuple[Table, ...]  # the main one first
-    figures: tuple[Figure, ...]
-    failures: tuple[str, ...] = ()  # one line each
+    tables: Sequence[Table]  # the main one first
+    figures: Sequence[Figure]
+    failures: Sequence[str] = ()  # one line each
 
     def files(self, name: str) -> dict[str, Figure]:
         """Return the figures by their files' names, <name>[_<figure>]."""
