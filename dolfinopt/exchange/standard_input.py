@@ -322,8 +322,8 @@ def _centrifugal_excess(data: sid.StandardInputData, dimension: int) -> np.ndarr
     if data.Oe.order == 0:
         return np.zeros_like(data.Me.M0)
     if dimension == 2:
-        return np.asarray(data.Me.M0 + data.Oe.M1[:, :, 2])
-    return np.asarray(data.Me.M0 + 0.5 * data.Oe.M1[:, :, :3].sum(axis=-1))
+        return data.Me.M0 + data.Oe.M1[:, :, 2]
+    return data.Me.M0 + 0.5 * data.Oe.M1[:, :, :3].sum(axis=-1)
 
 
 # -- what standard input data must fulfil: a sentence for everything that it does not --------------

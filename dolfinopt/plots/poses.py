@@ -78,7 +78,7 @@ class Poses:
         """Return points (..., d) of a body with modes (..., d, q) where they are, m."""
         e = self.q_e[n, self.mechanism.slices[body]]
         moved = points + modes @ e[: modes.shape[-1]]
-        return np.asarray(moved @ self.rotation[n, body].T + self.origin[n, body])
+        return moved @ self.rotation[n, body].T + self.origin[n, body]
 
     def sites(self, body: int, n: int) -> list[np.ndarray]:
         """Return the places (d,), m, of a body that something is fixed to."""

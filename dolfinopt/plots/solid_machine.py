@@ -70,7 +70,7 @@ class SolidStage:
         """Return where the machine stands (3,), m: as high as the world's origin, or lower."""
         first = self.poses.origin[0, self.poses.parents.index(GROUND)]
         height = np.clip(first @ self.up, 0.06 * self.size, 0.5 * self.size)
-        return np.asarray(first - height * self.up)
+        return first - height * self.up
 
     def _draw_ruler(self, low: np.ndarray, span: np.ndarray) -> None:
         """Draw a length of the plane, its lowest corner and size (2,), m, and the directions."""
@@ -159,7 +159,7 @@ def upwards(poses: Poses) -> np.ndarray:
     """Return the axis of the world (3,) that gravity points against most; z without gravity."""
     gravity = poses.mechanism.gravity[:, 0]
     k = int(np.argmax(np.abs(gravity))) if gravity.any() else 2
-    return np.asarray((-np.sign(gravity[k]) or 1.0) * np.eye(3)[k])
+    return (-np.sign(gravity[k]) or 1.0) * np.eye(3)[k]
 
 
 def camera_of(poses: Poses, up: np.ndarray) -> Camera:

@@ -82,7 +82,7 @@ class LinkCells:
     @property
     def extents(self) -> np.ndarray:
         """Extents (3,) along the axes of the arm's frame, m."""
-        return np.asarray(np.ptp(self.points, axis=0))
+        return np.ptp(self.points, axis=0)
 
     def ends_within(self, distance: float) -> float:
         """Return the volume of the cells whose middle is nearer to an interface, m3."""
@@ -308,7 +308,7 @@ def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
 def _connected(mask: np.ndarray) -> np.ndarray:
     """Return the largest connected part of what is True."""
     labels, _ = ndimage.label(mask)
-    return np.asarray(labels == 1 + int(np.bincount(labels.ravel())[1:].argmax()))
+    return labels == 1 + np.bincount(labels.ravel())[1:].argmax()
 
 
 def _ends(link: Trimesh, length: float) -> np.ndarray | None:
@@ -439,7 +439,7 @@ def _on_surface(
     while (bad := _jacobians(points + shift, cells).min(axis=1) < LEAST * side**3).any():
         shift[np.unique(cells[bad])] *= EASED if tries < 20 else 0.0
         tries += 1
-    return np.asarray(points + shift)
+    return points + shift
 
 
 def _jacobians(points: np.ndarray, cells: np.ndarray) -> np.ndarray:

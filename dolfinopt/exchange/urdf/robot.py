@@ -310,7 +310,7 @@ def _across(x: np.ndarray, *axes: np.ndarray) -> np.ndarray:
     """Return the direction across x that is nearest to the first axis with one, z or y."""
     result = (axis - (axis @ x) * x for axis in (*axes, *np.eye(3)[:0:-1]))
     across = next(item for item in result if np.linalg.norm(item) > 0.1)
-    return np.asarray(across / float(np.linalg.norm(across)))
+    return across / np.linalg.norm(across)
 
 
 # -- bodies and joints of a scene from a robot: chosen links become solids, the others are rigid
