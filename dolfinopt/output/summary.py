@@ -25,13 +25,13 @@ from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
 from dolfinopt.output.feed_forward import compared, lead_warnings, summary_of_feed_forward
-from dolfinopt.output.joint_limits import joint_limits
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import (
     UNITS,
     by_drive,
     drive_units,
     free_drives,
+    joint_limits,
     trajectory_units,
 )
 from dolfinopt.parallel import Partition, gather_arms, gather_tables, together
