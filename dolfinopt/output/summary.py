@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import resource
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -149,7 +149,7 @@ class _Traits:
     # cell_size, volume: of a cell the longest side, m; of all arms that have the design, m3
     cell_size: float
     volume: float
-    notes: tuple[str, ...]  # of the mesh
+    notes: Sequence[str]  # of the mesh
     contacts: Contacts  # how the design cut at one half hangs together
     widths: Widths = (None, None)  # of member and gap of the design cut at one half
     # first frequency of the arm by itself, Hz, and by how much that of the reduced model exceeds
@@ -454,7 +454,7 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         arm.grayness(x_phys),
         (scene.arms[index].cells and scene.arms[index].cell_size) or arm.mesh.cell_size,
         len(arm.places) * scene.arms[index].depth * arm.mesh.comm.allreduce(arm.mesh.area.sum()),
-        tuple(arm.mesh.notes),
+        arm.mesh.notes,
         arm.contacts(arm.kind.share(x_phys) > SOLID),
     )
     if arm.basis is None:

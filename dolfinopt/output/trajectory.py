@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -129,7 +129,7 @@ def by_drive(scene: Scene, values: np.ndarray) -> dict[str, float]:
     return dict(zip(scene.driven, map(float, values[scene.driven_columns]), strict=True))
 
 
-def free_drives(scene: Scene) -> tuple[str, ...]:
+def free_drives(scene: Scene) -> Sequence[str]:
     """Return the driven coordinates that may leave the desired motion: control, or soft joints."""
     if scene.control is not None:
         return scene.driven
@@ -137,7 +137,7 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
     names = list(scene.rigid_units)
     soft = {names[k] for k, item in pairs if k is not None and item.gear_stiffness > 0.0}
     soft |= {rod.name for rod in scene.rods if rod.is_spring}
-    return tuple(name for name in scene.driven if name in soft)
+    return [name for name in scene.driven if name in soft]
 
 
 def _closure_units(scene: Scene) -> dict[str, str]:

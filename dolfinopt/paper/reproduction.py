@@ -92,13 +92,13 @@ class Plan:
     """Everything the paper asks of a scene."""
 
     scene: Scene
-    variants: tuple[tuple[str, tuple[str, ...]], ...] = VARIANTS
-    optimised: tuple[int, ...] = (4, 48)  # coordinates that designs are made with
-    swept: tuple[int, ...] = (4, 6, 8, 12, 16, 24, 48, 100)  # and simulated with
-    masses: tuple[float, ...] = tuple(4.0 + 0.5 * k for k in range(9))  # kg, simulated
-    payloads: tuple[float, ...] = (4.0, 6.0, 8.0)  # kg, made for
-    flattenings: tuple[float, ...] = tuple(0.125 * k for k in range(9))  # simulated
-    paths: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)  # made for
+    variants: Sequence[tuple[str, tuple[str, ...]]] = VARIANTS
+    optimised: Sequence[int] = (4, 48)  # coordinates that designs are made with
+    swept: Sequence[int] = (4, 6, 8, 12, 16, 24, 48, 100)  # and simulated with
+    masses: Sequence[float] = tuple(4.0 + 0.5 * k for k in range(9))  # kg, simulated
+    payloads: Sequence[float] = (4.0, 6.0, 8.0)  # kg, made for
+    flattenings: Sequence[float] = tuple(0.125 * k for k in range(9))  # simulated
+    paths: Sequence[float] = (0.0, 0.25, 0.5, 0.75, 1.0)  # made for
 
     @property
     def optimum(self) -> Case:
@@ -372,7 +372,7 @@ class Check:
     demand: str
     holds: bool
     stands: bool
-    figures: tuple[int, ...]
+    figures: Sequence[int]
 
     @property
     def sentence(self) -> str:
@@ -398,7 +398,7 @@ def check_paper(results: pd.DataFrame) -> list[Check]:
     for item in TABLE["statement"]:
         texts = {k: environment.from_string(item.get(k, "")).render(values).strip() for k in TEXTS}
         holds, stands = verdict(item["holds"]), verdict(item.get("stands", "true"))
-        checks.append(Check(**texts, holds=holds, stands=stands, figures=tuple(item["figures"])))
+        checks.append(Check(**texts, holds=holds, stands=stands, figures=item["figures"]))
     return checks
 
 

@@ -71,7 +71,7 @@ class Case:
     action: Action = "simulate"
     design: Case | Path | None = None  # given; of an optimising case, of a file, or the initial one
     label: str = ""  # what progress and messages call it
-    samples: tuple[tuple[str, ...], ...] = ()  # what each changes, "key.path=value" each
+    samples: Sequence[Sequence[str]] = ()  # what each changes, "key.path=value" each
     first: int = 0  # number of the first sample, for messages
 
     @cached_property

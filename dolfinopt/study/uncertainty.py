@@ -353,20 +353,20 @@ def random_name(random: Sequence[str]) -> str:
     return file_name("uncertainty", *(text.partition("=")[0].strip() for text in random))
 
 
-def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...]]:
+def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[Sequence[str]]:
     """Return what makes each sample of the scene, as "key=value": nothing, and values (n, d)."""
-    rows = [tuple(f"{key}={v!r}" for key, v in zip(keys, row)) for row in values.tolist()]
-    return [(), *rows]
+    rows = [[f"{key}={v!r}" for key, v in zip(keys, row)] for row in values.tolist()]
+    return [[], *rows]
 
 
 def sample_cases(
-    scene: Scene, samples: Sequence[tuple[str, ...]], label: str, design: Design
+    scene: Scene, samples: Sequence[Sequence[str]], label: str, design: Design
 ) -> list[Case]:
     """Return the cases of one design: an interruption costs one, more samples leave them be."""
     keys = {change.partition("=")[0] for sample in samples for change in sample}
     size = CHUNK if scales_bodies(scene, keys) else REDUCED
     return [
-        Case(scene, "sample", design, label, tuple(samples[first : first + size]), first)
+        Case(scene, "sample", design, label, samples[first : first + size], first)
         for first in range(0, len(samples), size)
     ]
 

@@ -72,7 +72,7 @@ class LinkCells:
     inboard: np.ndarray
     outboard: np.ndarray
     side: float
-    done: tuple[str, ...] = ()
+    done: Sequence[str] = ()
 
     @property
     def volume(self) -> float:
@@ -99,7 +99,7 @@ class LinkCells:
         return float(np.linalg.norm(middles, axis=1).max())
 
 
-def _image(shape: tuple[int, ...], step: float, first: np.ndarray) -> Any:
+def _image(shape: Sequence[int], step: float, first: np.ndarray) -> Any:
     """Return PyVista's image whose points are the middles of voxels, the first one at `first`."""
     import pyvista
 

@@ -86,7 +86,7 @@ class RobotScene:
     """
 
     robot: Robot
-    bodies: tuple[SceneBody, ...]
+    bodies: Sequence[SceneBody]
     t: np.ndarray
     rows: np.ndarray
     loops: RobotLoops
@@ -316,14 +316,14 @@ def read_trajectory(
     return table.t, every, [*held, *_too_fast(robot, file, rates)]
 
 
-def _columns_of(robot: Robot, file: str, rods: Sequence[str]) -> tuple[str, ...]:
+def _columns_of(robot: Robot, file: str, rods: Sequence[str]) -> list[str]:
     """Return a table's columns but t: joints with a coordinate of their own, all driven rods."""
     names, joints = column_names(file), [joint.name for joint in robot.joints]
     own = [joint.name for joint in robot.movable if joint.mimic is None]
     allowed = f"expected t and any of {', '.join(own)}"
     if "t" not in names:
         raise InputError(f"{file}: no column t, the instants in s; {allowed}")
-    result = tuple(name for name in names if name != "t")
+    result = [name for name in names if name != "t"]
     if wrong := [name for name in result if name not in (*own, *rods)]:
         what = "this joint is fixed, or follows another" if wrong[0] in joints else "no such joint"
         raise InputError(f"{file}: column {wrong[0]!r}: {what}; {allowed}")
@@ -392,7 +392,7 @@ Warn = Callable[[list[str]], None]
 
 def scene_of_robot(
     robot: Robot,
-    links: tuple[str, ...],
+    links: Sequence[str],
     tool: str | None,
     trajectory: str,
     closures: Path | None,
@@ -420,7 +420,7 @@ def scene_of_robot(
     t, rows, said = read_trajectory(robot, trajectory, loops)
     warn([*said, *implausible_inertias(robot)])
     if not boxes:
-        bodies = tuple(meshed(robot, body, warn) if body.is_solid else body for body in bodies)
+        bodies = [meshed(robot, body, warn) if body.is_solid else body for body in bodies]
     return RobotScene(robot, bodies, t, rows, loops)
 
 
