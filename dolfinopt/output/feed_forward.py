@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from sys import maxsize
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +15,13 @@ from dolfinopt.disk import write_table
 from dolfinopt.dynamics.build import Trajectory, simulate
 from dolfinopt.dynamics.feed_forward import FeedForward, internal_rates
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.result import RankResult
 from dolfinopt.output.design import Designed
 from dolfinopt.output.trajectory import UNITS, by_drive, drive_units
 from dolfinopt.parallel import together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.csv_table import BESIDE_JOINTS
 from dolfinopt.scene.load import Scene, scene_from_dict
-
-if TYPE_CHECKING:
-    from dolfinopt.optimization.result import RankResult
 
 FILE = "feed_forward.csv"
 ROUNDING = 1e-6  # of an eigenvalue's real part, over its size

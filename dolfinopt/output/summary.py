@@ -8,7 +8,7 @@ import resource
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -24,6 +24,7 @@ from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
+from dolfinopt.optimization.result import RankResult, Result
 from dolfinopt.output.feed_forward import compared, lead_warnings, summary_of_feed_forward
 from dolfinopt.output.torsion import torsion_warnings
 from dolfinopt.output.trajectory import (
@@ -43,9 +44,6 @@ from dolfinopt.responses.stress_report import ArmStress, unjudged
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
 from dolfinopt.version import __version__
-
-if TYPE_CHECKING:
-    from dolfinopt.optimization.result import RankResult, Result
 
 CONTACTS = "pieces", "corners", "edges", "places", "left_out", "remaining"  # of `Contacts`
 

@@ -14,7 +14,7 @@ from PIL import Image
 from dolfinopt.disk import write_atomically
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots.poses import Poses, body_poses, even_instants, shown_poses
-from dolfinopt.plots.style import GREY, ORANGE, PathLike, decimals, round_number, styled
+from dolfinopt.plots.style import GREY, ORANGE, decimals, round_number, styled
 
 if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -196,7 +196,7 @@ def round_magnification(largest: float, size: float, turn: float = 0.0) -> float
 
 
 @styled
-def draw_motion(path: PathLike, views: Sequence[ArmView], film: Film) -> Path:
+def draw_motion(path: Path, views: Sequence[ArmView], film: Film) -> Path:
     """Draw the moving, deformed machine as an animated GIF of some seconds; return its path.
 
     Args:
@@ -223,12 +223,12 @@ def draw_motion(path: PathLike, views: Sequence[ArmView], film: Film) -> Path:
     finally:
         drawn.close()
     write_atomically(
-        Path(path),
+        path,
         lambda stream: first.save(
             stream, format="GIF", save_all=True, append_images=others, duration=delay, loop=0
         ),
     )
-    return Path(path)
+    return path
 
 
 def film_stage(views: Sequence[ArmView], film: Film, speed: float) -> Stage:

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyvista
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import ArmView
@@ -25,11 +27,6 @@ from dolfinopt.plots.style import (
     round_number,
     stacked_axes,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies

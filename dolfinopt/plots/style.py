@@ -6,7 +6,6 @@ Matplotlib is imported where it is used: most commands draw nothing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from itertools import chain
@@ -37,7 +36,6 @@ FEW_POINTS = 40  # of a line, which gets markers
 MILLI = 1e3
 SOLID_FROM = 0.05  # density from which a cell is drawn where void is left open
 
-PathLike = str | os.PathLike[str]
 Box = tuple[np.ndarray, np.ndarray]  # lowest and highest corner
 
 
@@ -244,8 +242,7 @@ def colour_scale(
     figure.colorbar(shown, cax=axes, orientation="horizontal", ticks=list(marks), label=label)
 
 
-def save(figure: Figure, path: PathLike) -> Path:
+def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG; return its path."""
-    target = Path(path)
-    write_atomically(target, lambda stream: figure.savefig(stream, format="png"))
-    return target
+    write_atomically(path, lambda stream: figure.savefig(stream, format="png"))
+    return path

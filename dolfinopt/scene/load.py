@@ -33,15 +33,6 @@ from dolfinopt.scene.tables.base import Refusal, input_error, loc_of, shown
 from dolfinopt.scene.tables.material import CATALOGUE
 from dolfinopt.scene.text import read_toml
 
-__all__ = [
-    "Arm",
-    "Scene",
-    "pose_scenarios",
-    "read_scene",
-    "resolve_file",
-    "scene_from_dict",
-]
-
 
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
     """Read, complete and validate the scene file `path` (TOML, UTF-8).

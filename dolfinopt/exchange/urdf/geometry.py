@@ -13,18 +13,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyvista
+import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from trimesh import Trimesh, boolean, creation, repair
 
 from dolfinopt.exchange.urdf.robot import CELLS, FEWEST, SceneBody, inverse
 from dolfinopt.mesh.checks import corner_jacobians
 from dolfinopt.mesh.solid_cells import TENSOR, boundary
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 MOST = 20000  # of one with thin walls
 FINE = 3  # voxels along the side of a cell
@@ -101,15 +101,11 @@ class LinkCells:
 
 def _image(shape: Sequence[int], step: float, first: np.ndarray) -> Any:
     """Return PyVista's image whose points are the middles of voxels, the first one at `first`."""
-    import pyvista
-
     return pyvista.ImageData(dimensions=shape, spacing=(step,) * 3, origin=first)
 
 
 def _nearest_places(solid: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return distances (n,) from a surface, m, and the nearest places (n, 3) on it."""
-    import pyvista
-
     surface: Any = pyvista.wrap(solid)
     _, places = surface.find_closest_cell(points, return_closest_point=True)
     return np.linalg.norm(points - places, axis=1), np.asarray(places)
@@ -117,8 +113,6 @@ def _nearest_places(solid: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.
 
 def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]:
     """Return the closed surface of what open pieces enclose, together with closed ones; or none."""
-    import trimesh
-
     whole: Any = trimesh.util.concatenate([*closed, *left])
     step, radius = float(np.ptp(whole.bounds, axis=0).max()) / SHELL, round(GAP * SHELL)
     grid, margin = whole.voxelized(step, max_iter=20), radius + 2  # for closing and opening
@@ -133,7 +127,7 @@ def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]
     image = _image(shell.shape, step, grid.translation - margin * step)
     image["inside"] = inside.ravel(order="F")
     surface = image.contour([SURFACE], "inside")
-    result = trimesh.Trimesh(surface.points, surface.regular_faces)
+    result = Trimesh(surface.points, surface.regular_faces)
     _turn_outwards(result)
     return [result]
 
@@ -196,8 +190,6 @@ def _thin_walls(solid: Trimesh, cells: LinkCells) -> list[str]:
 
 def _united(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> tuple[Trimesh, list[str]]:
     """Return what surfaces enclose, transformed, as one, and what was done to close them."""
-    from trimesh import boolean
-
     if not shapes:
         raise NoSolid("it has no geometry")
     closed: list[Trimesh] = []
@@ -254,9 +246,7 @@ def _pieces_of(count: int) -> str:
 
 def _tidy(shape: Trimesh, to_arm: np.ndarray) -> Trimesh:
     """Return a surface in the arm's frame: corners merged, no triangle twice or without area."""
-    import trimesh
-
-    result = trimesh.Trimesh(shape.vertices, shape.faces, process=True)
+    result = Trimesh(shape.vertices, shape.faces, process=True)
     result.merge_vertices(merge_tex=True, merge_norm=True)
     result.update_faces(result.nondegenerate_faces())
     result.update_faces(result.unique_faces())
@@ -277,8 +267,6 @@ def _lies_in_another(piece: Trimesh, pieces: Sequence[Trimesh]) -> bool:
 
 def _turn_outwards(piece: Trimesh) -> bool:
     """Turn the triangles of a closed piece outwards; return whether there was need to."""
-    from trimesh import repair
-
     if piece.is_winding_consistent and piece.volume > 0.0:
         return False
     repair.fix_winding(piece)
@@ -289,13 +277,10 @@ def _turn_outwards(piece: Trimesh) -> bool:
 
 def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
     """Return a piece with its holes closed by VTK; None where it stays open."""
-    import pyvista
-    import trimesh
-
     wide = 10.0 * float(np.ptp(piece.bounds, axis=0).max())
     surface = pyvista.wrap(piece)
     filled = surface.fill_holes(wide).triangulate()
-    closed = trimesh.Trimesh(filled.points, filled.regular_faces, process=True)
+    closed = Trimesh(filled.points, filled.regular_faces, process=True)
     if not closed.is_watertight or len(closed.faces) < 4:
         return None
     _turn_outwards(closed)
@@ -322,8 +307,6 @@ def _ends(link: Trimesh, length: float) -> np.ndarray | None:
 
 def _largest(solid: Trimesh) -> tuple[Trimesh, float]:
     """Return the largest body of a solid, with its cavities, and its share of the volume."""
-    import trimesh
-
     parts = list(solid.split(only_watertight=False, repair=False))
     outer = max(parts, key=lambda part: float(part.volume))
     inner = [part for part in parts if part.volume < 0.0 and _lies_in_another(part, [outer])]
@@ -336,8 +319,6 @@ def _between(link: Trimesh, ends: np.ndarray) -> tuple[Trimesh, float] | None:
 
     None without one, and where most of the link lies elsewhere.
     """
-    from trimesh import boolean, creation
-
     wider = link.bounds + np.array([[-1.0], [1.0]])
     wider[:, 0] = ends
     cut = boolean.intersection([link, creation.box(bounds=wider)], check_volume=False)
@@ -359,8 +340,6 @@ def _cells(
     length: float,
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
-    import pyvista
-
     low, high = piece.bounds.copy()
     side = min(side, float((high - low)[1:].min()) / FEWEST)
     if ends is not None:
