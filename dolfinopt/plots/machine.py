@@ -105,7 +105,7 @@ def _name_instant(drawn: Stage, poses: Poses, n: int, words: str) -> None:
         np.stack([poses.outboard[n, 0], poses.origin[n, 0]] if loop else
                  [poses.end[n], poses.origin[n, poses.mechanism.end[0]]])
     )  # fmt: skip
-    away = (end - inner) / max(float(np.linalg.norm(end - inner)), 1e-9)
+    away = (end - inner) / max(np.linalg.norm(end - inner), 1e-9)
     drawn.axes.annotate(
         words,
         tuple(end),
@@ -172,9 +172,9 @@ def make_film(
 def _magnification(bent: Poses, rigid: Poses) -> float:
     """Return the magnification that suits how far and by what angle bodies are off."""
     pairs = [(bent.outboard, rigid.outboard), (bent.held, rigid.held), (bent.end, rigid.end)]
-    largest = max(float(np.linalg.norm(a - b, axis=-1).max()) for a, b in pairs)
+    largest = max(np.linalg.norm(a - b, axis=-1).max() for a, b in pairs)
     turned = bent.rotation - rigid.rotation
-    turn = float(np.linalg.norm(turned, axis=(-2, -1)).max()) / np.sqrt(2.0)
+    turn = np.linalg.norm(turned, axis=(-2, -1)).max() / np.sqrt(2.0)
     return round_magnification(largest, rigid.size, turn)
 
 
@@ -206,7 +206,7 @@ def draw_motion(path: Path, views: Sequence[ArmView], film: Film) -> Path:
     """
     count = len(film.at)
     delay = max(20.0, 10.0 * round(100.0 * FILM_SECONDS / count))  # ms; GIF counts in 10 ms
-    speed = float(np.ptp(film.t)) / (1e-3 * delay * count)
+    speed = np.ptp(film.t) / (1e-3 * delay * count)
     drawn = film_stage(views, film, speed)
     try:
         draw = frame_drawer(drawn, film)

@@ -181,7 +181,7 @@ def surfaces_figure(parts: Sequence[tuple[str, Surface, Sequence[str]]], title: 
 def caption(view: ArmView, mass: float | None) -> str:
     """Return what stands above a link: its size, volume and mass."""
     volumes = cell_volumes(view)
-    volume = float(volumes @ view.solid)
+    volume = volumes @ view.solid
     filled = f" ({100.0 * volume / volumes.sum():.3g} %)"
     if view.wall is not None:
         thin, thick = MILLI * view.wall.min(), MILLI * view.wall.max()
@@ -233,7 +233,7 @@ def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: 
         studio.plotter.add_mesh(lines, style="wireframe", color=GREY, lighting=False, **PLAIN)
     studio.show(studio.close())
     axes.set_axis_off()
-    (low, high), px = box, float(np.ptp(axes.get_xlim())) / axes.bbox.width  # m
+    (low, high), px = box, np.ptp(axes.get_xlim()) / axes.bbox.width  # m
     corner = LINKS.plane(np.array([low[0], low[1], high[2]]))  # at the front, below
     draw_length(axes, corner - [0.0, 30.0 * px], round_number(0.2 * (high - low)[0]), 8.0 * px)
     draw_triad(axes, LINKS, corner + np.array([-42.0, 24.0]) * px, 26.0 * px)

@@ -78,7 +78,7 @@ def log_scale(axes: Axes, values: np.ndarray) -> None:
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     axes.set_yscale("log")
-    ratio = float(np.max(values)) / float(np.min(values))
+    ratio = np.max(values) / np.min(values)
     # A short axis would otherwise have one number, or none.
     subs = [1.0, 2.0, 5.0] if ratio < 50.0 else [1.0]
     short = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
@@ -120,7 +120,7 @@ def mixed(colour: str, strength: float) -> str:
 
 def decimals(t: np.ndarray) -> int:
     """Return how many decimals tell the instants (n,), s, of a motion of that length: 2 or more."""
-    span = float(np.ptp(t))
+    span = np.ptp(t)
     return 2 if span == 0.0 else max(2, 2 - int(np.floor(np.log10(span))))
 
 

@@ -114,7 +114,7 @@ def _nearest_places(solid: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.
 def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]:
     """Return the closed surface of what open pieces enclose, together with closed ones; or none."""
     whole: Any = trimesh.util.concatenate([*closed, *left])
-    step, radius = float(np.ptp(whole.bounds, axis=0).max()) / SHELL, round(GAP * SHELL)
+    step, radius = np.ptp(whole.bounds, axis=0).max() / SHELL, round(GAP * SHELL)
     grid, margin = whole.voxelized(step, max_iter=20), radius + 2  # for closing and opening
     shell = np.pad(grid.matrix, margin)
     shell = ndimage.binary_dilation(shell, iterations=radius)
@@ -157,7 +157,7 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
         notes.append("not cut at the joints: rigid where it is nearest to them")
         ends = None
     joints = np.array([[0.0, 0.0, 0.0], [body.length, 0.0, 0.0]])
-    away = float(_nearest_places(piece, joints)[0].max())
+    away = _nearest_places(piece, joints)[0].max()
     if away > NEAR * max(np.ptp(piece.bounds, axis=0).max(), body.length):
         raise NoSolid(f"its geometry is {away:.3g} m away from a joint")
     if share < KEPT_ALL:
@@ -197,7 +197,7 @@ def _united(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> tuple[Trimesh, lis
     left: list[Trimesh] = []
     filled = turned = dropped = 0
     every = [_tidy(piece, to_arm) for piece in shapes]
-    size = max(float(np.ptp(np.vstack([piece.bounds for piece in every]), axis=0).max()), 1e-9)
+    size = max(np.ptp(np.vstack([piece.bounds for piece in every]), axis=0).max(), 1e-9)
     for shape in every:
         if shape.is_volume and shape.body_count == 1:
             closed.append(shape)
@@ -215,7 +215,7 @@ def _united(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> tuple[Trimesh, lis
                     piece.invert()
                     hollows.append(piece)
                 else:
-                    turned += int(_turn_outwards(piece))
+                    turned += _turn_outwards(piece)
                     (closed if piece.is_volume else left).append(piece)
             elif (mended := _with_holes_closed(piece)) is not None:
                 filled += 1
@@ -277,7 +277,7 @@ def _turn_outwards(piece: Trimesh) -> bool:
 
 def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
     """Return a piece with its holes closed by VTK; None where it stays open."""
-    wide = 10.0 * float(np.ptp(piece.bounds, axis=0).max())
+    wide = 10.0 * np.ptp(piece.bounds, axis=0).max()
     surface = pyvista.wrap(piece)
     filled = surface.fill_holes(wide).triangulate()
     closed = Trimesh(filled.points, filled.regular_faces, process=True)
@@ -308,7 +308,7 @@ def _ends(link: Trimesh, length: float) -> np.ndarray | None:
 def _largest(solid: Trimesh) -> tuple[Trimesh, float]:
     """Return the largest body of a solid, with its cavities, and its share of the volume."""
     parts = list(solid.split(only_watertight=False, repair=False))
-    outer = max(parts, key=lambda part: float(part.volume))
+    outer = max(parts, key=lambda part: part.volume)
     inner = [part for part in parts if part.volume < 0.0 and _lies_in_another(part, [outer])]
     body: Any = trimesh.util.concatenate([outer, *inner])
     return body, float(body.volume / solid.volume)
@@ -341,7 +341,7 @@ def _cells(
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
     low, high = piece.bounds.copy()
-    side = min(side, float((high - low)[1:].min()) / FEWEST)
+    side = min(side, (high - low)[1:].min() / FEWEST)
     if ends is not None:
         low[0], high[0] = ends
         side = (ends[1] - ends[0]) / max(FEWEST, round((ends[1] - ends[0]) / side))
