@@ -41,7 +41,7 @@ def tip_compliance(scene: Scene, element: str, cells: Cells) -> tuple[float, int
 
     def solve(density: float) -> np.ndarray:
         state = arm.state(np.full(arm.mesh.num_cells, density))
-        return np.asarray(state.elastic.constraint_modes.stiffness)
+        return state.elastic.constraint_modes.stiffness
 
     solve(0.5)  # the first one analyses the matrix for the whole run
     seconds, _, stiffness = timed(partial(solve, 1.0))

@@ -75,9 +75,9 @@ class Case(Table):
                 raise ValueError(f"quantity {value.quantity}: expected one of {', '.join(known)}")
 
 
-def read_cases() -> tuple[Case, ...]:
+def read_cases() -> list[Case]:
     """Return all cases of the package's folder, in the order of their names."""
-    return tuple(read_case(file) for file in sorted(benchmark_folder().glob("*/case.toml")))
+    return [read_case(file) for file in sorted(benchmark_folder().glob("*/case.toml"))]
 
 
 def read_case(file: Path) -> Case:
@@ -89,7 +89,7 @@ def read_case(file: Path) -> Case:
         raise input_error(str(file), problem(error)) from None
 
 
-def chosen_cases(names: Sequence[str], records: bool = False) -> tuple[Case, ...]:
+def chosen_cases(names: Sequence[str], records: bool = False) -> list[Case]:
     """Return the cases of these names; without names the quick ones, of "all" the long ones, too.
 
     Without records, cases that need some are left out. InputError: there is no such case.
@@ -97,14 +97,14 @@ def chosen_cases(names: Sequence[str], records: bool = False) -> tuple[Case, ...
     known = {case.name: case for case in read_cases()}
     if not names or list(names) == ["all"]:
         possible = [case for case in known.values() if records or not case.records]
-        return tuple(case for case in possible if names or not case.long)
+        return [case for case in possible if names or not case.long]
     for name in names:
         if name not in known:
             expected = " | ".join(["all", *known])
             raise InputError(f"bench field {name}: no such case; expected {expected}")
         if known[name].records and not records:
             raise InputError(f"bench field {name}: name it as {name}=DIR, {known[name].records}")
-    return tuple(known[name] for name in dict.fromkeys(names))
+    return [known[name] for name in dict.fromkeys(names)]
 
 
 # -- what is compared ------------------------------------------------------------------------

@@ -34,10 +34,10 @@ class Diagram:
     columns: str  # of the rows, with units, " | " between them
     steps: Callable[[Plan], Steps]  # what is measured; rows of each are kept when it is done
     x: str
-    y: tuple[str, ...]  # columns, a panel each
+    y: Sequence[str]  # columns, a panel each
     by: str  # column: a curve for every value
     note: str  # on what is measured
-    each: tuple[str, ...] = ()  # columns; every combination of values has panels of its own
+    each: Sequence[str] = ()  # columns; every combination of values has panels of its own
     drawn: Callable[[Frame], Frame] = Frame.copy  # returns the frame that is drawn
 
     def frame(self, rows: Iterable[Row]) -> Frame:
@@ -86,5 +86,5 @@ def figure_of(diagram: Diagram, frame: Frame) -> LineFigure:
         for y in diagram.y:
             result = curves(part, diagram.x, y, diagram.by)
             lines = [Line(name, *points.to_numpy().T) for name, points in result.items()]
-            panels.append(Panel(title, diagram.x, y, tuple(lines), log=True))
-    return LineFigure(diagram.name, diagram.title, tuple(panels))
+            panels.append(Panel(title, diagram.x, y, lines, log=True))
+    return LineFigure(diagram.name, diagram.title, panels)

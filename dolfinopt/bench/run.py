@@ -31,12 +31,12 @@ DIAGRAMS = accuracy.MOTION, iterations.ITERATION, accuracy.ELEMENTS, accuracy.TO
 NAMED = iterations.OPTIMISER, solid.SOLID
 
 
-def named(names: Sequence[str]) -> tuple[Diagram, ...]:
+def named(names: Sequence[str]) -> Sequence[Diagram]:
     """Return the diagrams of these names; all of plane arms for none."""
     known = {item.name: item for item in (*DIAGRAMS, *NAMED)}
     if wrong := [name for name in names if name not in known]:
         raise InputError(f"bench: no diagram {wrong[0]!r}: expected {' | '.join(known)}")
-    return tuple(known[name] for name in names) or DIAGRAMS
+    return [known[name] for name in names] or DIAGRAMS
 
 
 def bench(

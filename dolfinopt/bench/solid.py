@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from functools import partial
 from itertools import chain, product
@@ -13,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 
 from dolfinopt.arms.arm import Arm, field_tolerance
-from dolfinopt.bench.measure import Plan, in_processes, mpirun, program
+from dolfinopt.bench.measure import Plan, in_processes, mpirun, program, timed
 from dolfinopt.bench.panel import Diagram, Rows, Steps
 from dolfinopt.fem.multigrid import MultigridSolver
 from dolfinopt.mesh.arm_mesh import box_arm
@@ -57,9 +56,7 @@ def box_beam(centroid: np.ndarray) -> np.ndarray:
 def _seconds(comm: MPI.Comm, action: Callable[[np.ndarray], Any], x: np.ndarray) -> float:
     """Return the CPU seconds of action(x), those of the slowest rank (collective)."""
     comm.Barrier()
-    begun = time.process_time()
-    action(x)
-    return float(comm.allreduce(time.process_time() - begun, op=MPI.MAX))
+    return float(comm.allreduce(timed(partial(action, x))[0], op=MPI.MAX))
 
 
 def iterate_link(comm: MPI.Comm, scene: Scene, cells: Cells, static: bool = False) -> Found:

@@ -245,11 +245,11 @@ def _links(world: MPI.Comm, scene: Scene, run: Path) -> _Links:
 
     folder, owners = run / PARTS, dict(zip(scene.places, scene.owners, strict=True))
     if not on_root(world, lambda: (folder / SCENE).is_file() and not stale_parts(folder)):
-        bodies = _reduced(world, scene, run / "design.npz")
+        bodies = arms_with_design(world, scene, run / "design.npz", Profile()).bodies()
         parts = make_parts(scene, run, world=world)
         return {name: (bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
     machine: Scene = on_root(world, load_scene, folder / SCENE)
-    bodies = _reduced(world, machine, None)
+    bodies = arms_with_design(world, machine, None, Profile()).bodies()
     links = {}
     for k, arm in enumerate(machine.arms):
         owner = owners.get(arm.name)
@@ -266,14 +266,6 @@ def _surface(file: Path) -> np.ndarray:
 
     mesh = pyvista.read(file)
     return 1e-3 * mesh.points[mesh.regular_faces].astype(float)
-
-
-def _reduced(world: MPI.Comm, scene: Scene, design: Path | None) -> dict[int, ShapeIntegrals]:
-    """Return arms with a design, reduced, on the root (collective); None: as they begin."""
-    place = arms_with_design(world, scene, design, Profile())
-    with together(world):
-        mine = {k: arm.reduce(place.x_phys[k]) for k, arm in place.arms.items()}
-    return gather_arms(place.partition, mine)
 
 
 # -- before and after ------------------------------------------------------------------------

@@ -41,7 +41,7 @@ def part(
     optimize: bool | None,
     iterations: int | None,
     starts: int | None,
-    overrides: tuple[str, ...],
+    overrides: Sequence[str],
     resume: bool,
     overwrite: bool,
     plots: bool,

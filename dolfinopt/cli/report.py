@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from dolfinopt.cli.shared import chosen, warn
 from dolfinopt.data import filled
+from dolfinopt.optimization.result import Result
 from dolfinopt.optimization.stopping import StopCode
 from dolfinopt.output.summary import is_grey
 from dolfinopt.progress import with_unit
 from dolfinopt.responses.constraints import limits_of
 from dolfinopt.responses.response import objective_of
-
-if TYPE_CHECKING:
-    from dolfinopt.optimization.result import Result
 
 
 def conclude(

@@ -44,14 +44,14 @@ def import_robot(
                 known = os.environ.get("ROS_PACKAGE_PATH", "")
                 os.environ["ROS_PACKAGE_PATH"] = os.pathsep.join([*package_path, known])
                 model = read_robot(robot)
-                scene, t, rows = scene_of_robot(model, chosen, tool, table, closures, boxes, warn)
+                scene = scene_of_robot(model, chosen, tool, table, closures, boxes, warn)
                 folder = out or Path(robot.stem)
-                new = scene.files(folder, t, rows)
-            _write_scene(folder, overwrite, scene, new, rows.shape[1])
+                new = scene.files(folder)
+            _write_scene(folder, overwrite, scene, new)
 
 
 def _write_scene(
-    folder: Path, overwrite: bool, scene: RobotScene, new: dict[str, str | bytes], joints: int
+    folder: Path, overwrite: bool, scene: RobotScene, new: dict[str, str | bytes]
 ) -> None:
     """Write scene, table and record, and say what they are."""
     *_, name = new
@@ -61,7 +61,7 @@ def _write_scene(
     else:
         check_new((folder / item for item in new), kept)
     write_files(folder, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n", **new})
-    click.echo(filled("imported.txt.jinja", {}, path=path, scene=scene, joints=joints), nl=False)
+    click.echo(filled("imported.txt.jinja", {}, path=path, scene=scene), nl=False)
     try:
         load_scene(path)
     except InputError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -32,7 +32,7 @@ from dolfinopt.scene.messages import assumed
 from dolfinopt.scene.schema import found_again
 
 
-def load(world: MPI.Comm, path: Path, overrides: tuple[str, ...]) -> Scene:
+def load(world: MPI.Comm, path: Path, overrides: Sequence[str]) -> Scene:
     """Return the scene as the root read and checked it."""
 
     def load() -> Scene:
@@ -66,7 +66,7 @@ def claim(
         on_root(world, partial(check_unused, resume=resume), folder, names)
 
 
-def scene_of(folder: Path, overrides: tuple[str, ...] = ()) -> Scene:
+def scene_of(folder: Path, overrides: Sequence[str] = ()) -> Scene:
     """Return the scene of a run, with the coordinates and stiffening that it came to."""
     path = folder / "summary.json"
     try:

@@ -41,7 +41,7 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
         scene: Path,
         out: Path | None,
         overwrite: bool,
-        overrides: tuple[str, ...],
+        overrides: Sequence[str],
         plots: bool,
         keep: bool = True,
         **own: Any,
@@ -59,11 +59,11 @@ def study_command(ask: Callable[..., Question]) -> Callable[..., None]:
 
         def conclude() -> None:
             remove_stale(folder, listed_files(folder / f"{name}.json"))
-            written = write_study(done, folder)
+            written = write_study(done, name, folder)
             if plots:
                 from dolfinopt.study.figures import draw_all
 
-                written += draw_all(done.files, folder)
+                written += draw_all(done.files(name), folder)
             _write_question(folder, name, asked, [path.name for path in written])
             click.echo(done.markdown())
             click.echo(f"{runner.computed} cases computed; tables and pictures in {folder}")
@@ -101,8 +101,8 @@ def _write_question(
 def sweep(
     scene: Scene,
     preset: Any,
-    vary: tuple[str, ...],
-    designs: tuple[Path, ...],
+    vary: Sequence[str],
+    designs: Sequence[Path],
     reoptimize: bool,
 ) -> Question:
     """Simulate designs of a scene for a range of values."""
@@ -114,8 +114,8 @@ def sweep(
 def compare(
     scene: Scene,
     what: str,
-    kinds: tuple[str, ...],
-    designs: tuple[Path, ...],
+    kinds: Sequence[str],
+    designs: Sequence[Path],
 ) -> Question:
     """Compare designs of a scene: by objectives, reductions, with sections, on motions."""
     if what in ("sections", "motions"):
@@ -135,7 +135,7 @@ def compare(
 
 @study_command
 def uncertainty(
-    scene: Scene, random: tuple[str, ...], designs: tuple[Path, ...], samples: int, seed: int
+    scene: Scene, random: Sequence[str], designs: Sequence[Path], samples: int, seed: int
 ) -> Question:
     """Simulate designs of a scene with random values: statistics and Sobol' indices."""
     from dolfinopt.study.uncertainty import random_name, study_random
@@ -146,9 +146,9 @@ def uncertainty(
 
 def reproduce(
     world: MPI.Comm,
-    variants: tuple[str, ...],
+    variants: Sequence[str],
     out: Path | None,
-    overrides: tuple[str, ...],
+    overrides: Sequence[str],
     plots: bool,
 ) -> None:
     """Recreate figures of the paper, and a page that compares its statements with ours."""
@@ -159,7 +159,7 @@ def reproduce(
     overrides = (*(paper.FITTED if fitted else ()), *overrides)
     scene = on_root(world, paper.load_paper, coarse, overrides)
     plan = paper.Plan(scene)
-    results, outcomes = paper.reproduce(plan, folder, world)
+    results, outcomes = Runner(folder, world).follow(paper.reproduce(plan))
     checks = paper.check_paper(results)
 
     def conclude() -> None:
@@ -176,7 +176,7 @@ def reproduce(
         raise ConvergenceError("; ".join(wrong))
 
 
-def bench(world: MPI.Comm, names: tuple[str, ...], out: Path | None) -> None:
+def bench(world: MPI.Comm, names: Sequence[str], out: Path | None) -> None:
     """Measure run time against error, or check the benchmark of the field."""
     quick = "quick" in names
     names = tuple(name for name in names if name != "quick")
@@ -194,7 +194,7 @@ def bench(world: MPI.Comm, names: tuple[str, ...], out: Path | None) -> None:
 
 
 def _check_field(
-    world: MPI.Comm, out: Path | None, names: tuple[str, ...], records: Path | None
+    world: MPI.Comm, out: Path | None, names: Sequence[str], records: Path | None
 ) -> None:
     """Run cases of the benchmark on the root; print each one's values when it is done."""
     from dolfinopt.bench.field import check, chosen_cases, table_of
@@ -217,7 +217,7 @@ def _check_field(
     click.echo(f"{len(result)} values within their limits")
 
 
-def _measure(world: MPI.Comm, names: tuple[str, ...], out: Path | None, quick: bool) -> None:
+def _measure(world: MPI.Comm, names: Sequence[str], out: Path | None, quick: bool) -> None:
     """Measure and draw diagrams."""
     from dolfinopt.bench.run import QUICKLY, Plan, named
     from dolfinopt.bench.run import bench as run

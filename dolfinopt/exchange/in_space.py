@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals, integrated
-
-if TYPE_CHECKING:
-    from dolfinopt.fem.elasticity import ElasticArm
-    from dolfinopt.reduction import Basis
+from dolfinopt.reduction import Basis
 
 
 def in_space(body: ShapeIntegrals, W: np.ndarray | None = None) -> ShapeIntegrals:

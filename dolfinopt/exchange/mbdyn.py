@@ -35,7 +35,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -43,12 +42,10 @@ from dolfinopt.data import filled
 from dolfinopt.disk import write_text
 from dolfinopt.exchange.measured import SAME_NODE_SHARE
 from dolfinopt.exchange.standard_input import about, centrifugal, turning
+from dolfinopt.fem.elasticity import ElasticArm
 from dolfinopt.multibody.rotations import PERMUTATION
 from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-
-if TYPE_CHECKING:
-    from dolfinopt.fem.elasticity import ElasticArm
-    from dolfinopt.reduction import Basis
+from dolfinopt.reduction import Basis
 
 
 @dataclass(frozen=True, eq=False)

@@ -72,10 +72,10 @@ def to_sid(body: ShapeIntegrals, comment: str = "") -> sid.StandardInputData:
         names=tuple(f"Eigen Mode {k:4d} : {f:12.3f} Hz" for k, f in enumerate(frequency, 1)),
         nodes=(held, *further, tip),
         comment=comment,
-        Me=sid.taylor(body.M, nq=q, structure=sid.SYMMETRIC),
-        ksigma=sid.taylor(np.zeros((q, 1)), nq=q, structure=sid.ZERO),
-        Ke=sid.taylor(body.K, nq=q, structure=sid.SYMMETRIC),
-        De=sid.taylor(body.D, nq=q, structure=sid.structure_of(body.D)),
+        Me=sid.taylor(q, body.M, structure=sid.SYMMETRIC),
+        ksigma=sid.taylor(q, np.zeros((q, 1))),
+        Ke=sid.taylor(q, body.K, structure=sid.SYMMETRIC),
+        De=sid.taylor(q, body.D, structure=sid.structure_of(body.D)),
         **_inertia_matrices(body),
     )
 
@@ -83,16 +83,16 @@ def to_sid(body: ShapeIntegrals, comment: str = "") -> sid.StandardInputData:
 def _node(name: str, point: np.ndarray, modes: np.ndarray, K0: np.ndarray) -> sid.Node:
     """Return a node from its place, its displacements and rotations (6, q) and their K0."""
     q, (phi, psi) = modes.shape[1], np.split(modes, 2)
-    general = partial(sid.taylor, nq=q, structure=sid.GENERAL)
+    matrix = partial(sid.taylor, q)
     phi_q, psi_q = np.split(_clean(-K0), 2) if len(K0) else (None, None)
     turn = _clean(skew(psi.T)).transpose(1, 0, 2)  # row, coordinate, column
     return sid.Node(
         name=name,
         rframe="body ref",
-        origin=general(point[:, None], phi[:, :, None].copy()),
-        phi=general(phi, phi_q),
-        psi=general(psi, psi_q),
-        AP=sid.taylor(ONE, turn, nq=q, structure=sid.GENERAL if turn.any() else sid.UNIT),
+        origin=matrix(point[:, None], phi[:, :, None].copy()),
+        phi=matrix(phi, phi_q),
+        psi=matrix(psi, psi_q),
+        AP=matrix(ONE, turn, sid.GENERAL if turn.any() else sid.UNIT),
     )
 
 
@@ -118,10 +118,9 @@ def _inertia_matrices(body: ShapeIntegrals) -> dict[str, sid.Taylor]:
     }
     return {
         name: sid.taylor(
+            q,
             _clean(value),
             None if more is None else _clean(more).reshape(len(value), q, value.shape[1]),
-            nq=q,
-            structure=sid.GENERAL,
         )
         for name, (value, more) in result.items()
     }
@@ -237,11 +236,11 @@ def from_sid(
     q, along, about = data.num_modes, *_axes(dimension)
     K0, K0_outboard = np.zeros((0, q, q)), np.zeros((0, q, q))
     moments = _plane_moments if dimension == 2 else _spatial_moments
-    W, rotation = moments(data, bool(_first_order(data.Ct)[:, :, along].any()))
+    W, rotation = moments(data, bool(data.Ct.M1[:, :, along].any()))
     if len(rotation):
         push = -data.Ct.M1.transpose(2, 0, 1)[along]
         own = [
-            -_first_order(matrix)[rows]
+            -matrix.M1[rows]
             for tip in tips
             for matrix, rows in ((tip.phi, along), (tip.psi, about))
         ]
@@ -271,12 +270,6 @@ def _axes(dimension: int) -> tuple[slice, slice]:
     return slice(dimension), slice(2 if dimension == 2 else 0, 3)
 
 
-def _first_order(matrix: sid.Taylor) -> np.ndarray:
-    """Return M1 (nrow, nq, ncol), zero of order 0."""
-    nrow, ncol = matrix.M0.shape
-    return matrix.M1 if matrix.order else np.zeros((nrow, matrix.M1.shape[1], ncol))
-
-
 def _plane_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return W (2, 1 + q, 1 + q), and K0 (2, q, q) by wd and -w^2 or none."""
     q = data.num_modes
@@ -287,14 +280,14 @@ def _plane_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.nda
     W[:, 1:, 1:] = 0.5 * (data.Me.M0 + data.Me.M0.T), 0.5 * (G - G.T)
     if not stiffened:
         return W, np.zeros((0, q, q))
-    turn = _first_order(data.Cr)[:, :, 2]  # its skew part is G
+    turn = data.Cr.M1[:, :, 2]  # its skew part is G
     return W, np.stack([-turn, _centrifugal_excess(data, 2)])
 
 
 def _spatial_moments(data: sid.StandardInputData, stiffened: bool) -> tuple[np.ndarray, np.ndarray]:
     """Return W (9, 1 + q, 1 + q), and K0_ab (9, q, q) or none; told apart as above."""
     q = data.num_modes
-    symmetric, turned = _from_rows(data.Oe.M1, _first_order(data.Cr))
+    symmetric, turned = _from_rows(data.Oe.M1, data.Cr.M1)
     K0 = np.zeros_like(symmetric)
     if stiffened:
         # The part of Y_ab - Y_ba that is symmetric in the coordinates is K0_ba - K0_ab.
@@ -329,8 +322,8 @@ def _centrifugal_excess(data: sid.StandardInputData, dimension: int) -> np.ndarr
     if data.Oe.order == 0:
         return np.zeros_like(data.Me.M0)
     if dimension == 2:
-        return np.asarray(data.Me.M0 + data.Oe.M1[:, :, 2])
-    return np.asarray(data.Me.M0 + 0.5 * data.Oe.M1[:, :, :3].sum(axis=-1))
+        return data.Me.M0 + data.Oe.M1[:, :, 2]
+    return data.Me.M0 + 0.5 * data.Oe.M1[:, :, :3].sum(axis=-1)
 
 
 # -- what standard input data must fulfil: a sentence for everything that it does not --------------
@@ -454,11 +447,11 @@ def _half_stiffened(
     along, _ = _axes(dimension)
     excess, Me = _centrifugal_excess(data, dimension), data.Me.M0
     rotation = bool(np.abs(excess).max() > CENTRIFUGAL_EXCESS_SHARE * np.abs(Me).max())
-    result = {"m1 of Ct": bool(_first_order(data.Ct)[:, :, along].any())}
+    result = {"m1 of Ct": bool(data.Ct.M1[:, :, along].any())}
     if dimension == 2:
         result["m1 of Oe beyond -Me"] = rotation
     for tip in tips:
-        result[f"m1 of phi of node {tip.name}"] = bool(_first_order(tip.phi)[along].any())
+        result[f"m1 of phi of node {tip.name}"] = bool(tip.phi.M1[along].any())
     present = [name for name in result if result[name]]
     lacking = [name for name in result if not result[name]]
     if present and lacking:

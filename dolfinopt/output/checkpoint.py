@@ -8,7 +8,7 @@ import json
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,18 +18,19 @@ import numpy as np
 from dolfinopt.disk import write_arrays
 from dolfinopt.dynamics.collocation import Strategy
 from dolfinopt.errors import InputError
-from dolfinopt.optimization.state import Memory
+from dolfinopt.optimization.state import HistoryRow, Memory
+from dolfinopt.output.design import append_history, write_history
 from dolfinopt.output.folders import CHECKPOINT, remove_stale
 from dolfinopt.parallel import Partition, gather_tables, on_root, together
 from dolfinopt.scene.law_variables import LAW
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.schema import DIGEST, flattened, program, with_digests
+from dolfinopt.scene.schema import DIGEST, flattened, program, scene_content
 from dolfinopt.solver import user_options
 
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
-NAME = CHECKPOINT
+NAME, HISTORY = CHECKPOINT, "history.csv"
 SEAL = "digest"  # of all other arrays
 # All that a pickled memory may name: a file from elsewhere can run nothing.
 CLASSES = {
@@ -44,14 +45,13 @@ MAKERS = "ndarray", "dtype", "_reconstruct", "_frombuffer", "scalar"  # of NumPy
 MAY_CHANGE = {
     *(f"optimizer.{key}" for key in ("max_iterations", "tolerance", "kkt_tolerance")),
     "objective.gradient",
+    "name",  # which earlier versions kept
 }
 
 
 def _scene_text(scene: Scene) -> str:
     """Return the scene as JSON; its files by their content, so that a project can be moved."""
-    data = with_digests(scene.to_dict())
-    del data["part"]  # which comes after the run
-    return json.dumps(data, sort_keys=True)
+    return json.dumps(scene_content(scene), sort_keys=True)
 
 
 def begin(folder: Path, scene: Scene) -> None:
@@ -80,18 +80,6 @@ def _stamp(scene: Scene) -> dict[str, np.ndarray]:
     }
 
 
-def save(
-    folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm], memory: Memory
-) -> None:
-    """Replace the checkpoint atomically (collective)."""
-    with together(partition.world):
-        own = {k: _of_arm(arm, k, memory) for k, arm in arms.items()}
-    tables = gather_tables(partition, own)
-    with together(partition.world):
-        if partition.world.rank == 0:
-            _sealed(folder, {**_stamp(scene), "memory": _packed(memory, tables)})
-
-
 def _sealed(folder: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write the checkpoint with a digest, so that a changed one is known."""
     write_arrays(folder / NAME, {**arrays, SEAL: np.array(_digest(arrays))})
@@ -112,21 +100,52 @@ def check(folder: Path, scene: Scene) -> None:
     _read(folder, scene)
 
 
-def load(
-    folder: Path, scene: Scene, partition: Partition, arms: Mapping[int, Arm]
-) -> Memory | None:
-    """Return the memory of an interrupted run, or None when it had only begun (collective).
+@dataclass(frozen=True, eq=False)
+class FolderRecorder:
+    """Writes history.csv and checkpoint.npz, see `loop.Recorder`, and reads the latter.
 
-    Rows go to the cells and nodes at the same place, on any number of ranks.
-
-    Raises:
-        InputError: no checkpoint, a damaged one, or one of another scene.
+    Attributes:
+        folder: exists.
+        scene, partition, arms: what the checkpoint describes.
     """
-    arrays = on_root(partition.world, _read, folder, scene)
-    if "memory" not in arrays:
-        return None
-    with together(partition.world):
-        return _memory(arrays["memory"], arms)
+
+    folder: Path
+    scene: Scene
+    partition: Partition
+    arms: Mapping[int, Arm]
+
+    def begin(self, rows: Sequence[HistoryRow]) -> None:
+        """Write the history anew with the rows known so far (collective)."""
+        on_root(self.partition.world, write_history, self.folder / HISTORY, rows)
+
+    def append(self, row: HistoryRow) -> None:
+        """Add a line to the history (root only)."""
+        append_history(self.folder / HISTORY, row)
+
+    def save(self, memory: Memory) -> None:
+        """Replace the checkpoint atomically (collective)."""
+        with together(self.partition.world):
+            own = {k: _of_arm(arm, k, memory) for k, arm in self.arms.items()}
+        tables = gather_tables(self.partition, own)
+
+        def write() -> None:
+            _sealed(self.folder, {**_stamp(self.scene), "memory": _packed(memory, tables)})
+
+        on_root(self.partition.world, write)
+
+    def load(self) -> Memory | None:
+        """Return the memory of an interrupted run, or None when it had only begun (collective).
+
+        Rows go to the cells and nodes at the same place, on any number of ranks.
+
+        Raises:
+            InputError: no checkpoint, a damaged one, or one of another scene.
+        """
+        arrays = on_root(self.partition.world, _read, self.folder, self.scene)
+        if "memory" not in arrays:
+            return None
+        with together(self.partition.world):
+            return _memory(arrays["memory"], self.arms)
 
 
 def _read(folder: Path, scene: Scene) -> dict[str, np.ndarray]:

@@ -21,7 +21,7 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.optimization.state import HistoryRow
-from dolfinopt.parallel import Partition, gather_tables, on_root, together
+from dolfinopt.parallel import Partition, gather_arms, gather_tables, on_root, together
 from dolfinopt.scene.law_variables import LAW, law_names, law_values, with_law
 from dolfinopt.scene.load import Arm as ArmKeys
 from dolfinopt.scene.load import Scene
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from dolfinopt.arms.arm import Arm
     from dolfinopt.mesh.arm_mesh import ArmMesh
+    from dolfinopt.multibody.shape_integrals import ShapeIntegrals
     from dolfinopt.profiling import Profile
     from dolfinopt.responses.stress_report import ArmStress
 
@@ -230,7 +231,7 @@ def write_gradient(
             order, name = canonical_order(table["centroid"]), scene.arms[index].name
             arrays |= {f"{name}/{key}": values[order] for key, values in table.items()}
         unit = scene.objective.response.unit  # per physical density, which has none
-        arrays["units"] = np.array([f"objective: {unit}", "centroid: m", f"gradient: {unit}"])
+        arrays["units"] = [f"objective: {unit}", "centroid: m", f"gradient: {unit}"]
         write_arrays(path, arrays)
 
 
@@ -283,6 +284,15 @@ class Designed(NamedTuple):
     arms: Mapping[int, Arm]
     x_phys: Mapping[int, np.ndarray]
 
+    def bodies(self) -> dict[int, ShapeIntegrals]:
+        """Return the arms reduced under the scene, on the root (collective).
+
+        The arms keep what they have.
+        """
+        with together(self.partition.world):
+            own = {k: arm.under(self.scene).reduce(self.x_phys[k]) for k, arm in self.arms.items()}
+        return gather_arms(self.partition, own)
+
 
 def arms_with_design(
     world: MPI.Comm, scene: Scene, design: Path | None, profile: Profile
@@ -301,8 +311,10 @@ def arms_with_design(
     partition = partition_arms(world, scene.cell_counts, undivided=scene.dimension == 2)
     arms = build_arms(scene, partition, profile)
     if design is None:
-        return Designed(scene, partition, arms, uniform_design(scene, partition, arms))
-    return Designed(scene, partition, arms, read_design(design, partition, arms))
+        x_phys = uniform_design(scene, partition, arms)
+    else:
+        x_phys = read_design(design, partition, arms)
+    return Designed(scene, partition, arms, x_phys)
 
 
 def read_design(path: Path, partition: Partition, arms: Mapping[int, Arm]) -> dict[int, np.ndarray]:

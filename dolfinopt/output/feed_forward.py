@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from sys import maxsize
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,15 +15,13 @@ from dolfinopt.disk import write_table
 from dolfinopt.dynamics.build import Trajectory, simulate
 from dolfinopt.dynamics.feed_forward import FeedForward, internal_rates
 from dolfinopt.errors import ConvergenceError
+from dolfinopt.optimization.result import RankResult
 from dolfinopt.output.design import Designed
-from dolfinopt.output.trajectory import UNITS, drive_units
-from dolfinopt.parallel import gather_arms, on_root, together
+from dolfinopt.output.trajectory import UNITS, by_drive, drive_units
+from dolfinopt.parallel import together
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.csv_table import BESIDE_JOINTS
 from dolfinopt.scene.load import Scene, scene_from_dict
-
-if TYPE_CHECKING:
-    from dolfinopt.optimization.result import RankResult
 
 FILE = "feed_forward.csv"
 ROUNDING = 1e-6  # of an eigenvalue's real part, over its size
@@ -33,43 +30,20 @@ ROUNDING = 1e-6  # of an eigenvalue's real part, over its size
 # -- what it is compared with --------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """What a machine with feed-forward is compared with; None where that is not solved.
-
-    Attributes:
-        deviation: without corrections, m; `peaks` of the drives then, by their names, N m or N.
-        finer: deviation in a finer model that moves with the corrections, m.
-    """
-
-    deviation: float | None
-    peaks: Mapping[str, float]
-    finer: float | None
-
-
-def comparison_of(run: RankResult) -> Comparison | None:
+def compared(run: RankResult) -> tuple[Trajectory | None, float | None]:
     """Simulate the design without its feed-forward, and in a finer model with it (collective).
 
-    None where the scene has no feed-forward.
+    On the root the motion without corrections, and the deviation, m, in a finer model that moves
+    with them; None where that is not solved, or the scene has no feed-forward, and elsewhere.
     """
     scene = run.scene
     if not scene.feed_forward.on:
-        return None
+        return None, None
     held = None if run.trajectory is None else run.trajectory.feed_forward
     place = Designed(scene, run.partition, run.arms, run.x_phys)
     with run.profile.phase("feed-forward beside"):
         plain = simulated_with(place._replace(scene=with_feed_forward(scene, "none")))
-        finer = finer_deviation(place, held)
-
-    def comparison() -> Comparison:
-        if plain is None:
-            return Comparison(None, {}, finer)
-        peaks = map(float, plain.drives[0][scene.driven_columns])
-        return Comparison(
-            plain.max_deviation[0], dict(zip(scene.driven, peaks, strict=True)), finer
-        )
-
-    return on_root(run.partition.world, comparison)
+        return plain, finer_deviation(place, held)
 
 
 def with_feed_forward(scene: Scene, kind: str) -> Scene:
@@ -82,25 +56,26 @@ def with_feed_forward(scene: Scene, kind: str) -> Scene:
 
 
 def finer_deviation(design: Designed, held: FeedForward | None) -> float | None:
-    """Return the largest deviation in a finer model, m; None where it is not solved (collective).
+    """Return the largest deviation in a finer model, m, on the root (collective).
 
-    It has twice the elastic coordinates, and geometric stiffness.
+    It has twice the elastic coordinates, and geometric stiffness. None elsewhere, and where it is
+    not solved.
 
     Args:
         design: of the model, with the number of coordinates.
         held: the model's corrections, on the root, with which the finer one moves, too.
     """
-    scene, world = design.scene, design.partition.world
+    scene = design.scene
     sizes = [
         min(2 * (arm.coordinates or 0), arm.substructure.T.num_dofs) for arm in design.arms.values()
     ]
-    count = world.allreduce(min(sizes, default=maxsize), min)
+    count = design.partition.world.allreduce(min(sizes, default=maxsize), min)
     changes = {
         "reduction": scene.reduction.unchecked_copy({"coordinates": count}),
         "simulation": scene.simulation.unchecked_copy({"stiffening": True}),
     }
     moved = simulated_with(design._replace(scene=scene.unchecked_copy(changes)), held)
-    return on_root(world, lambda: None if moved is None else moved.max_deviation[0])
+    return None if moved is None else moved.max_deviation[0]
 
 
 def simulated_with(design: Designed, held: FeedForward | None = None) -> Trajectory | None:
@@ -108,19 +83,11 @@ def simulated_with(design: Designed, held: FeedForward | None = None) -> Traject
 
     None elsewhere, and where it is not solved. The arms keep what they have.
     """
-    scene, partition, arms, x_phys = design
-    with together(partition.world):
-        bodies = {k: arm.under(scene).reduce(x_phys[k]) for k, arm in arms.items()}
-    owned = gather_arms(partition, bodies)
-
-    result: list[Trajectory] = []
-
-    def run() -> None:
-        with suppress(ConvergenceError):
-            result.append(simulate(scene, chain_of(scene, owned), Profile(), feed_forward=held))
-
-    on_root(partition.world, run)
-    return result[0] if result else None
+    scene, world, bodies = design.scene, design.partition.world, design.bodies()
+    with together(world), suppress(ConvergenceError):
+        if world.rank == 0:
+            return simulate(scene, chain_of(scene, bodies), Profile(), feed_forward=held)
+    return None
 
 
 # -- table and summary -----------------------------------------------------------------------
@@ -143,11 +110,11 @@ def write_feed_forward(folder: Path, trajectory: Trajectory) -> None:
 
 
 def summary_of_feed_forward(
-    trajectory: Trajectory, comparison: Comparison | None
+    trajectory: Trajectory, plain: Trajectory | None, finer: float | None
 ) -> dict[str, Any] | None:
-    """Return what summary.json tells of a feed-forward; None without."""
+    """Return what summary.json tells of a feed-forward, with what `compared` has; or None."""
     scene, feed_forward = trajectory.scene, trajectory.feed_forward
-    if feed_forward is None or comparison is None:
+    if feed_forward is None:
         return None
     names, units = list(scene.rigid_units), list(scene.rigid_units.values())
     joints, splines = feed_forward.corrections.joints, feed_forward.corrections.splines
@@ -158,10 +125,10 @@ def summary_of_feed_forward(
         "lead": scene.lead,
         "knots": len(splines.knots),
         "regularity": feed_forward.regularity,
-        "deviation_without": comparison.deviation,
+        "deviation_without": None if plain is None else plain.max_deviation[0],
         "deviation_left": feed_forward.left,
-        "deviation_left_finer": comparison.finer,
-        "drive_peak_without": dict(comparison.peaks),
+        "deviation_left_finer": finer,
+        "drive_peak_without": {} if plain is None else by_drive(scene, plain.drives[0]),
         "corrections": {names[k]: float(x) for k, x in zip(joints, largest, strict=True)},
         "slowest_unstable_rate": slowest_unstable_rate(feed_forward),
         "units": {

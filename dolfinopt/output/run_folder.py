@@ -6,9 +6,8 @@ Results get into the folder together, the summary last: a folder that holds one 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,16 +19,13 @@ from dolfinopt.errors import InputError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.loop import Optimization, Report
 from dolfinopt.optimization.result import RankResult
-from dolfinopt.optimization.state import HistoryRow, Memory
 from dolfinopt.output import checkpoint
 from dolfinopt.output.design import (
     ArmView,
     Designed,
-    append_history,
     gather_views,
     write_design,
     write_fields,
-    write_history,
 )
 from dolfinopt.output.feed_forward import write_feed_forward
 from dolfinopt.output.folders import (
@@ -55,7 +51,6 @@ from dolfinopt.scene.schema import named_files, with_relative_paths
 if TYPE_CHECKING:
     from dolfinopt.arms.arm import Arm
 
-HISTORY = "history.csv"
 Draw = Callable[[Path, list[ArmView]], None]
 
 
@@ -129,35 +124,6 @@ def simulated(design: Designed, profile: Profile) -> RankResult:
 # -- an optimisation in a folder -------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class FolderRecorder:
-    """Writes history.csv and checkpoint.npz, see `loop.Recorder`.
-
-    Attributes:
-        folder: exists.
-        scene, partition, arms: what the checkpoint describes.
-    """
-
-    folder: Path
-    scene: Scene
-    partition: Partition
-    arms: Mapping[int, Arm]
-
-    def begin(self, rows: Sequence[HistoryRow]) -> None:
-        """Write the history anew with the rows known so far (collective)."""
-        with together(self.partition.world):
-            if self.partition.world.rank == 0:
-                write_history(self.folder / HISTORY, rows)
-
-    def append(self, row: HistoryRow) -> None:
-        """Add a line to the history (root only)."""
-        append_history(self.folder / HISTORY, row)
-
-    def save(self, memory: Memory) -> None:
-        """Replace the checkpoint (collective)."""
-        checkpoint.save(self.folder, self.scene, self.partition, self.arms, memory)
-
-
 def optimize(
     scene: Scene,
     folder: Path | None = None,
@@ -212,13 +178,13 @@ def optimize(
                 built = partition, build_arms(scene, partition, profile)
         memory, recorder = None, None
         if folder is not None:
+            recorder = checkpoint.FolderRecorder(folder, scene, *built)
             if overwrite:  # not before: a mesh that fails leaves the old results
                 on_root(world, checkpoint.begin, folder, scene)
             if resume:
-                memory = checkpoint.load(folder, scene, *built)
+                memory = recorder.load()
                 # What will be written anew goes, so that nothing old stands beside it.
-                old = [name for name in RUN_FILES if name not in (checkpoint.NAME, HISTORY)]
-                on_root(world, remove_stale, folder, old)
-            recorder = FolderRecorder(folder, scene, *built)
+                kept = checkpoint.NAME, checkpoint.HISTORY
+                on_root(world, remove_stale, folder, [x for x in RUN_FILES if x not in kept])
         evaluator = Evaluator(scene, *built, profile)
         return Optimization(evaluator, recorder, report, compared, x0).go(memory)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import platform
 import resource
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -24,10 +24,17 @@ from dolfinopt.mesh import compat
 from dolfinopt.motion.build import forced_rest, loop_start, misfit
 from dolfinopt.multibody.loads import Stiffening
 from dolfinopt.multibody.measured import STIFFNESS_CHANGE_LIMIT
-from dolfinopt.output.feed_forward import comparison_of, lead_warnings, summary_of_feed_forward
-from dolfinopt.output.joint_limits import joint_limits
+from dolfinopt.optimization.result import RankResult, Result
+from dolfinopt.output.feed_forward import compared, lead_warnings, summary_of_feed_forward
 from dolfinopt.output.torsion import torsion_warnings
-from dolfinopt.output.trajectory import UNITS, drive_units, free_drives, trajectory_units
+from dolfinopt.output.trajectory import (
+    UNITS,
+    by_drive,
+    drive_units,
+    free_drives,
+    joint_limits,
+    trajectory_units,
+)
 from dolfinopt.parallel import Partition, gather_arms, gather_tables, together
 from dolfinopt.profiling import Counts
 from dolfinopt.responses.constraints import limits_of, summary_of
@@ -37,9 +44,6 @@ from dolfinopt.responses.stress_report import ArmStress, unjudged
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.messages import implausible
 from dolfinopt.version import __version__
-
-if TYPE_CHECKING:
-    from dolfinopt.optimization.result import RankResult, Result
 
 CONTACTS = "pieces", "corners", "edges", "places", "left_out", "remaining"  # of `Contacts`
 
@@ -74,7 +78,7 @@ def summarise(
     """
     scene, partition, trajectory = run.scene, run.partition, run.trajectory
     cost = _cost(run, wall)  # without what follows
-    traits, comparison = _gather_traits(run), comparison_of(run)
+    traits, comparison = _gather_traits(run), compared(run)
     stiffening = stiffening_of(run.arms)
     with together(partition.world):
         if trajectory is None:  # this is not the root
@@ -84,7 +88,7 @@ def summarise(
             **_figures(run.evaluation),
             **_machine(trajectory),
             "loop_start": loop_start(scene),
-            "feed_forward": summary_of_feed_forward(trajectory, comparison),
+            "feed_forward": summary_of_feed_forward(trajectory, *comparison),
             "deflection_budget": budget_of(trajectory),
             "stress": _stress(scene, stress or {}),
             **_of_designs(run, trajectory, traits),
@@ -143,7 +147,7 @@ class _Traits:
     # cell_size, volume: of a cell the longest side, m; of all arms that have the design, m3
     cell_size: float
     volume: float
-    notes: tuple[str, ...]  # of the mesh
+    notes: Sequence[str]  # of the mesh
     contacts: Contacts  # how the design cut at one half hangs together
     widths: Widths = (None, None)  # of member and gap of the design cut at one half
     # first frequency of the arm by itself, Hz, and by how much that of the reduced model exceeds
@@ -154,15 +158,15 @@ class _Traits:
 
 def _gather_traits(run: RankResult) -> dict[int, _Traits]:
     """Return the traits of every design, on the root (collective)."""
-    partition, arms, x_phys, counts = run.partition, run.arms, run.x_phys, run.profile.counts
+    partition, counts = run.partition, run.profile.counts
     run.profile.counts = replace(counts)  # nothing of the result depends on what follows
     with together(partition.world):
-        mine = {k: _traits(run.scene, k, arm, x_phys[k]) for k, arm in arms.items()}
+        mine = {k: _traits(run.scene, k, arm, run.x_phys[k]) for k, arm in run.arms.items()}
     run.profile.counts = counts
     traits = gather_arms(partition, mine)
     if partition.world.bcast(is_grey(run.scene, _grayness(traits)), root=0):
         return traits
-    widths = _widths(partition, arms, x_phys)
+    widths = _widths(run.scene, partition, run.arms, run.x_phys)
     return {k: replace(item, widths=widths.get(k, item.widths)) for k, item in traits.items()}
 
 
@@ -313,18 +317,23 @@ def _all_warnings(
 
 
 def _cost(run: RankResult, wall: float) -> dict[str, Any]:
-    """Return seconds by phase, counts, memory and ranks, on the root (collective)."""
+    """Return seconds by phase, those of the slowest rank, counts, memory and number of ranks.
+
+    On the root, an empty dict elsewhere (collective).
+    """
     world = run.partition.world
-    every = world.allgather(dict(run.profile.seconds))  # of every rank; the slowest counts
-    phases = dict.fromkeys(phase for item in every for phase in item)
-    seconds = {phase: max(item.get(phase, 0.0) for item in every) for phase in phases}
-    own = (run.counts or run.profile.counts) if run.partition.is_root else Counts()
-    counted = world.gather(own, root=0)
-    memory = world.gather(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0, root=0)
+    counts = (run.counts or run.profile.counts) if run.partition.is_root else Counts()
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    every = world.gather((dict(run.profile.seconds), counts, memory), root=0)
+    if every is None:
+        return {}
+    seconds, counted, memories = zip(*every, strict=True)
+    phases = dict.fromkeys(phase for own in seconds for phase in own)
+    slowest = {phase: max(own.get(phase, 0.0) for own in seconds) for phase in phases}
     return {
-        "seconds": {**seconds, "total": wall},
-        "counts": asdict(sum(counted or (), Counts())),
-        "peak_memory_mb": max(memory or [0.0]),
+        "seconds": {**slowest, "total": wall},
+        "counts": asdict(sum(counted, Counts())),
+        "peak_memory_mb": max(memories),
         "ranks": world.size,
     }
 
@@ -332,10 +341,6 @@ def _cost(run: RankResult, wall: float) -> dict[str, Any]:
 def _machine(trajectory: Trajectory) -> dict[str, Any]:
     """Return masses, drives and residual vibration; of machines control errors and reactions."""
     scene, bodies = trajectory.scene, trajectory.mechanism.arms
-
-    def by_drive(values: np.ndarray) -> dict[str, float]:
-        return dict(zip(scene.driven, map(float, values[scene.driven_columns]), strict=True))
-
     peak, rms = trajectory.drives
     pairs = zip(bodies, scene.owners, strict=True)
     result = {
@@ -343,8 +348,8 @@ def _machine(trajectory: Trajectory) -> dict[str, Any]:
         "settling": trajectory.settling,
         "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
         "designed_mass": float(sum(body.mass for body, owner in pairs if owner is not None)),
-        "drive_peak": by_drive(peak),
-        "drive_rms": by_drive(rms),
+        "drive_peak": by_drive(scene, peak),
+        "drive_rms": by_drive(scene, rms),
     }
     limits: dict[str, dict[str, Any]] = {}
     for limit in joint_limits(trajectory):
@@ -353,16 +358,13 @@ def _machine(trajectory: Trajectory) -> dict[str, Any]:
     if limits:
         result["joint_limits"] = limits
     if free := free_drives(scene):
-        errors = by_drive(np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
+        errors = by_drive(scene, np.abs(trajectory.q_r - trajectory.desired.q).max(axis=0))
         result["drive_error_peak"] = {name: errors[name] for name in free}
     if trajectory.closure_sizes:
         result["closure_peak"] = {
             name: {unit: float(size.max()) for unit, size in sizes.items()}
             for name, sizes in trajectory.closure_sizes.items()
         }
-    if trajectory.closure is not None:
-        (sizes,) = trajectory.closure_sizes.values()
-        result["closure_force_peak"] = float(sizes["N"].max())
     return result
 
 
@@ -409,35 +411,32 @@ def _units(trajectory: Trajectory) -> dict[str, Any]:
     if scene.closures:
         parts = {closure.name: closure.parts(scene.dimension) for closure in scene.closures}
         units["closure_peak"] = {name: {u: u for _, u in own} for name, own in parts.items()}
-        units |= {} if scene.is_spatial else {"closure_force_peak": "N"}
     units["history.csv"] = {"objective": unit, **UNITS["history"], "multipliers": unit}
     units["trajectory.csv"] = trajectory_units(trajectory)
     return units
 
 
 def _widths(
-    partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
+    scene: Scene, partition: Partition, arms: Mapping[int, Arm], x_phys: Mapping[int, np.ndarray]
 ) -> dict[int, Widths]:
     """Return the widths of member and gap of the designs cut at one half; on the root."""
     # Of solid arms where the scene asks for a width: voxels take seconds.
     mine: dict[int, dict[str, np.ndarray]] = {}
-    asked = {}
     with together(partition.world):
         for k, arm in arms.items():
-            mesh, design = arm.mesh, arm.scene.design
-            if mesh.dim == 3 and not design.controls_widths:
+            mesh = arm.mesh
+            if mesh.dim == 3 and not scene.design.controls_widths:
                 continue
             points = compat.cell_coordinates(mesh.mesh, mesh.num_cells)[:, :, : mesh.dim]
             table = {"corners": points, "solid": x_phys[k] > SOLID, "fixed": mesh.fixed}
-            if arm.scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
+            if scene.arms[k].extruded:  # the same over the thickness: the lowest layer tells
                 table["corners"] = points[:, :4, :2]
-                lowest = _lowest(mesh.comm, points[:, :4, 2], arm.scene.arms[k].thickness)
+                lowest = _lowest(mesh.comm, points[:, :4, 2], scene.arms[k].thickness)
                 table = {name: values[lowest] for name, values in table.items()}
             mine[k] = table
-            asked[k] = max(design.least_widths)
-    tables, asked = gather_tables(partition, mine), gather_arms(partition, asked)
+    tables, asked = gather_tables(partition, mine), max(scene.design.least_widths)
     with together(partition.world):
-        return {k: widths_of(**table, asked=asked[k]) for k, table in tables.items()}
+        return {k: widths_of(**table, asked=asked) for k, table in tables.items()}
 
 
 def _lowest(comm: MPI.Comm, z: np.ndarray, thickness: float) -> np.ndarray:
@@ -453,7 +452,7 @@ def _traits(scene: Scene, index: int, arm: Arm, x_phys: np.ndarray) -> _Traits:
         arm.grayness(x_phys),
         (scene.arms[index].cells and scene.arms[index].cell_size) or arm.mesh.cell_size,
         len(arm.places) * scene.arms[index].depth * arm.mesh.comm.allreduce(arm.mesh.area.sum()),
-        tuple(arm.mesh.notes),
+        arm.mesh.notes,
         arm.contacts(arm.kind.share(x_phys) > SOLID),
     )
     if arm.basis is None:

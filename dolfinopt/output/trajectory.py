@@ -1,8 +1,9 @@
-"""trajectory.npz and trajectory.csv: the sampled motion, and the units of its columns."""
+"""trajectory.npz and trajectory.csv: the sampled motion, its units, and limits of its joints."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from dolfinopt.data import tables_of
 from dolfinopt.disk import read_arrays, write_arrays, write_table
+from dolfinopt.dynamics.measured import FILE_ROUNDING
 from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
 from dolfinopt.scene.tables.joints import joint_drives
@@ -122,7 +124,12 @@ def drive_units(scene: Scene) -> dict[str, str]:
     return {name: FORCE_OF[units[name]] for name in scene.driven}
 
 
-def free_drives(scene: Scene) -> tuple[str, ...]:
+def by_drive(scene: Scene, values: np.ndarray) -> dict[str, float]:
+    """Return those of the drives among values (n,) of all rigid coordinates, by their names."""
+    return dict(zip(scene.driven, map(float, values[scene.driven_columns]), strict=True))
+
+
+def free_drives(scene: Scene) -> Sequence[str]:
     """Return the driven coordinates that may leave the desired motion: control, or soft joints."""
     if scene.control is not None:
         return scene.driven
@@ -130,7 +137,7 @@ def free_drives(scene: Scene) -> tuple[str, ...]:
     names = list(scene.rigid_units)
     soft = {names[k] for k, item in pairs if k is not None and item.gear_stiffness > 0.0}
     soft |= {rod.name for rod in scene.rods if rod.is_spring}
-    return tuple(name for name in scene.driven if name in soft)
+    return [name for name in scene.driven if name in soft]
 
 
 def _closure_units(scene: Scene) -> dict[str, str]:
@@ -160,3 +167,61 @@ def read_initial_deviation(path: Path, even: np.ndarray) -> np.ndarray | None:
 def _between(t: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Return values (n, d) at other instants, straight between those at t."""
     return np.stack([np.interp(wanted, t, column) for column in values.T], axis=1)
+
+
+# -- how near a motion comes to the limits that a scene states of its joints ---------------------
+
+
+@dataclass(frozen=True)
+class JointLimit:
+    """How near a motion comes to one of a joint's limits.
+
+    Attributes:
+        joint: its name.
+        quantity: "position", "velocity" or "effort".
+        limit: of the coordinate, or of the absolute value.
+        value: where it is nearest to the limit or farthest beyond it.
+        instant: of that, s.
+        unit: of limit and value.
+        met: whether it stays within the limit.
+    """
+
+    joint: str
+    quantity: str
+    limit: float
+    value: float
+    instant: float
+    unit: str
+    met: bool
+
+    @property
+    def sentence(self) -> str:
+        """E.g. "elbow 3.2 of 3.1416 rad at 1.2 s"."""
+        used = f"{self.joint} {self.value:.4g} of {self.limit:.4g} {self.unit}"
+        return f"{used} at {self.instant:.3g} s"
+
+
+def joint_limits(trajectory: Trajectory) -> Iterator[JointLimit]:
+    """Yield how a motion stands to every limit of position, velocity and effort."""
+    motion, forces = trajectory.motion, trajectory.joint_forces
+    for k, joint in enumerate(trajectory.scene.movable):
+        unit = trajectory.scene.rigid_units[joint.name]
+        for quantity, bounds, values, of in (
+            ("position", joint.position_limits, motion.q, unit),
+            ("velocity", joint.velocity_limit, motion.qd, f"{unit}/s"),
+            ("effort", joint.effort_limit, forces, FORCE_OF[unit]),
+        ):
+            if bounds is None:
+                continue
+            lower, upper = bounds if isinstance(bounds, tuple) else (-bounds, bounds)
+            x = values[:, k]
+            over = np.maximum(lower - x, x - upper)
+            worst = int(np.argmax(over))
+            value = float(x[worst])
+            limit = lower if value - lower < upper - value else upper
+            scale = max(upper - lower, abs(limit)) if quantity == "position" else upper
+            if quantity != "position":  # of the absolute value
+                value, limit = abs(value), upper
+            met = bool(over[worst] <= FILE_ROUNDING * (scale or 1.0))
+            at = float(trajectory.t[worst])
+            yield JointLimit(joint.name, quantity, limit, value, at, of, met)

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pandas as pd
@@ -25,17 +25,12 @@ import pandas as pd
 from dolfinopt.data import paper_scene, tables_of
 from dolfinopt.disk import write_text
 from dolfinopt.loading import load_scene
-from dolfinopt.output.folders import prepare_folder
-from dolfinopt.parallel import on_root, together
 from dolfinopt.plots.panels import Line, Panel
 from dolfinopt.scene.load import Scene
 from dolfinopt.study import studies, variants
-from dolfinopt.study.cases import Case, Outcome, Outcomes, run_cases
+from dolfinopt.study.cases import Case, Outcome, Outcomes, Steps
 from dolfinopt.study.studies import QUANTITIES
 from dolfinopt.study.tables import Figure, LineFigure, Table, html_page
-
-if TYPE_CHECKING:
-    from mpi4py import MPI
 
 CRAIG_BAMPTON, _ = METHODS = ("craig-bampton", "modal")
 INITIAL, OPTIMUM, SOLID = "initial design", "optimised design", "solid arms"
@@ -62,11 +57,24 @@ FITTED = (
     "motion.cart_follow=0.25", "motion.joint_height=-0.5", "motion.duration=2.865",
     "objective.load_cases=47",
 )  # fmt: skip
-COLUMNS = ["table", "label", "kind", "x", "made_for", "case", "made"]
-MEASURED = [*COLUMNS[:5], *"compliance deviation grayness iterations note own apart".split()]
+# Columns of measured.json.
+MEASURED = (
+    "table label kind x made_for compliance deviation grayness iterations note own apart".split()
+)
 
-Row: TypeAlias = tuple[str, str, str, float, float, Case, Case]
 Figures: TypeAlias = dict[int, tuple[Figure, LineFigure | Table]]  # with what has their data
+
+
+class Row(NamedTuple):
+    """A row of the table, see the module."""
+
+    table: str
+    label: str
+    case: Case
+    made: Case
+    kind: str = ""
+    x: float = math.nan
+    made_for: float = math.nan
 
 
 def load_paper(coarse: bool = False, overrides: Sequence[str] = ()) -> Scene:
@@ -84,13 +92,13 @@ class Plan:
     """Everything the paper asks of a scene."""
 
     scene: Scene
-    variants: tuple[tuple[str, tuple[str, ...]], ...] = VARIANTS
-    optimised: tuple[int, ...] = (4, 48)  # coordinates that designs are made with
-    swept: tuple[int, ...] = (4, 6, 8, 12, 16, 24, 48, 100)  # and simulated with
-    masses: tuple[float, ...] = tuple(4.0 + 0.5 * k for k in range(9))  # kg, simulated
-    payloads: tuple[float, ...] = (4.0, 6.0, 8.0)  # kg, made for
-    flattenings: tuple[float, ...] = tuple(0.125 * k for k in range(9))  # simulated
-    paths: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)  # made for
+    variants: Sequence[tuple[str, tuple[str, ...]]] = VARIANTS
+    optimised: Sequence[int] = (4, 48)  # coordinates that designs are made with
+    swept: Sequence[int] = (4, 6, 8, 12, 16, 24, 48, 100)  # and simulated with
+    masses: Sequence[float] = tuple(4.0 + 0.5 * k for k in range(9))  # kg, simulated
+    payloads: Sequence[float] = (4.0, 6.0, 8.0)  # kg, made for
+    flattenings: Sequence[float] = tuple(0.125 * k for k in range(9))  # simulated
+    paths: Sequence[float] = (0.0, 0.25, 0.5, 0.75, 1.0)  # made for
 
     @property
     def optimum(self) -> Case:
@@ -103,16 +111,16 @@ class Plan:
         rows = [*self._objectives(), *self._reductions()]
         rows += self._sweep("payload", self.masses, self.payloads)
         rows += self._sweep("path", self.flattenings, self.paths)
-        return pd.DataFrame(rows, columns=COLUMNS)
+        return pd.DataFrame(rows)
 
     def _objectives(self) -> Iterator[Row]:
         """Yield the initial design, and one for every objective."""
         initial = Case(self.scene, label=INITIAL)
-        yield "objectives", INITIAL, "", math.nan, math.nan, initial, initial
+        yield Row("objectives", INITIAL, initial, initial)
         for label, settings in self.variants:
             scene = variants.with_objective(self.scene, *settings)
             case = Case(scene, "optimize", label=label)
-            yield "objectives", label, scene.objective.kind, math.nan, math.nan, case, case
+            yield Row("objectives", label, case, case, scene.objective.kind)
 
     def _reductions(self) -> Iterator[Row]:
         """Yield designs made with either reduction, in the reference model; two with all others."""
@@ -120,11 +128,11 @@ class Plan:
         for method, count, scene in self._reduced(self.optimised):
             made = Case(scene, "optimize", label=f"{method} {count}")
             again = Case(reference, "simulate", made, f"{made.label} in the reference")
-            yield "reductions", made.label, method, count, math.nan, again, made
+            yield Row("reductions", made.label, again, made, method, count)
         for label, design in ((INITIAL, None), (OPTIMUM, self.optimum)):
             for method, count, scene in self._reduced(self.swept):
                 case = Case(scene, "simulate", design, f"{label}, {method} {count}")
-                yield "coordinates", label, method, count, math.nan, case, case
+                yield Row("coordinates", label, case, case, method, count)
 
     def _reduced(self, counts: Sequence[int]) -> Iterator[tuple[str, int, Scene]]:
         """Yield the scene with either method; small arms have no more than their coordinates."""
@@ -145,19 +153,16 @@ class Plan:
             for value, scene in scenes.items():
                 there = variants.changed(scene, "design.initial=1.0") if label == SOLID else scene
                 case = Case(there, "simulate", design, f"{label}, {words.format(value)}")
-                yield table, label, "", value, made_for, case, design or case
+                yield Row(table, label, case, design or case, x=value, made_for=made_for)
 
 
-def reproduce(plan: Plan, folder: Path, world: MPI.Comm) -> tuple[pd.DataFrame, Outcomes]:
-    """Return the plan's table with results, and all outcomes; the same on all ranks (collective).
+def reproduce(plan: Plan) -> Steps[tuple[pd.DataFrame, Outcomes]]:
+    """Return the steps to the plan's table with results, and all outcomes, see `Runner.follow`.
 
-    InputError where the scene does not allow what the paper varies, or DIR cannot be written.
+    InputError where the scene does not allow what the paper varies.
     """
-    with together(world):
-        cases = [*plan.table.case, *plan.table.made]
-    on_root(world, prepare_folder, folder)
-    outcomes = run_cases(cases, folder, world)
-    return on_root(world, add_outcomes, plan.table, outcomes), outcomes
+    outcomes = yield [*plan.table.case, *plan.table.made]
+    return add_outcomes(plan.table, outcomes), outcomes
 
 
 def add_outcomes(table: pd.DataFrame, outcomes: Outcomes) -> pd.DataFrame:
@@ -200,15 +205,15 @@ def _deviations_apart(outcome: Outcome, other: Outcome) -> float:
     return float(np.abs(a - b).max() / b.max())
 
 
-def cross_values(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
-    """Return a quantity (n, n) of designs made for value i of a sweep, used at value j.
+def made_values(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
+    """Return a quantity (n, m) of designs made for n values of a sweep, used at all m.
 
     Args:
         rows: of one sweep, with one scene at least for every value that a design was made for.
         quantity: name of its column.
     """
     made = rows.dropna(subset="made_for")
-    return made.pivot(index="made_for", columns="x", values=quantity)[made.made_for.unique()]
+    return made.pivot(index="made_for", columns="x", values=quantity)
 
 
 def loss(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
@@ -216,8 +221,9 @@ def loss(rows: pd.DataFrame, quantity: str) -> pd.DataFrame:
 
     With the value v_ij of the design made for i, used at j: v_ij / v_jj - 1.
     """
-    values = cross_values(rows, quantity)
-    return values / np.diag(values) - 1.0
+    values = made_values(rows, quantity)
+    used = values[values.index]
+    return used / np.diag(used) - 1.0
 
 
 # -- figures and files -----------------------------------------------------------------------
@@ -248,10 +254,10 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
     shown = [good(objectives.case[objectives.label.isin(n)]) for n in ((INITIAL, SHOWN[0]), SHOWN)]
     with_modes = "Deviation of designs made with either reduction, simulated with Craig-Bampton"
     axes = "elastic coordinates of each arm [-]", QUANTITIES[0]
-    by_count = tuple(
+    by_count = [
         Panel(label, *axes, studies.lines_by(item, "kind", "x", axes[1]), x_log2=True)
         for label, item in coordinates.astype({"x": int}).groupby("label", sort=False)
-    )
+    ]
     lines = [
         _over_time("Deviation of the end-effector by objective", *shown),
         *_convergence(good(reductions.made)),
@@ -277,7 +283,7 @@ def all_figures(results: pd.DataFrame, outcomes: Outcomes) -> Figures:
 def _over_time(title: str, *groups: Sequence[Outcome]) -> LineFigure:
     """Return deviations over time; empty axes where nothing could be simulated."""
     panels = [panel for outcomes in groups for panel in studies.deviation_panels(outcomes)]
-    return LineFigure("", title, tuple(panels) or (Panel("", "time [s]", "deviation [mm]", ()),))
+    return LineFigure("", title, panels or [Panel("", "time [s]", "deviation [mm]", ())])
 
 
 def _convergence(outcomes: Sequence[Outcome]) -> Iterator[LineFigure]:
@@ -292,14 +298,14 @@ def _convergence(outcomes: Sequence[Outcome]) -> Iterator[LineFigure]:
             lines.append(Line(item.case.label, np.array(x), np.array(y)))
         seen = key == "objective"
         title = "as the own model sees it" * seen
-        panel = Panel(title, "iteration [-]", label, tuple(lines), y_log=seen or None)
-        yield LineFigure("", f"Convergence of the {what} by reduction", (panel,))
+        panel = Panel(title, "iteration [-]", label, lines, y_log=seen or None)
+        yield LineFigure("", f"Convergence of the {what} by reduction", [panel])
 
 
 def _sweep(rows: pd.DataFrame, name: str, quantity: str) -> LineFigure:
     """Return a quantity over the swept value; the initial design has a scale of its own."""
     axis, lines = SWEEPS[name][1], studies.lines_by(rows, "label", "x", quantity)
-    panels = tuple(Panel("", axis, quantity, group) for group in (lines[:1], lines[1:]))
+    panels = [Panel("", axis, quantity, group) for group in (lines[:1], lines[1:])]
     what, by = (text.partition(" [")[0] for text in (quantity, axis))
     return LineFigure("", f"{what.capitalize()} against {by}", panels)
 
@@ -366,7 +372,7 @@ class Check:
     demand: str
     holds: bool
     stands: bool
-    figures: tuple[int, ...]
+    figures: Sequence[int]
 
     @property
     def sentence(self) -> str:
@@ -392,7 +398,7 @@ def check_paper(results: pd.DataFrame) -> list[Check]:
     for item in TABLE["statement"]:
         texts = {k: environment.from_string(item.get(k, "")).render(values).strip() for k in TEXTS}
         holds, stands = verdict(item["holds"]), verdict(item.get("stands", "true"))
-        checks.append(Check(**texts, holds=holds, stands=stands, figures=tuple(item["figures"])))
+        checks.append(Check(**texts, holds=holds, stands=stands, figures=item["figures"]))
     return checks
 
 
@@ -511,7 +517,7 @@ def _of_payloads(rows: pd.DataFrame) -> dict[str, Any]:
         payload_loss: see `_losses`.
     """
     x, designs = rows.x.unique(), dict(iter(rows.groupby("label")))
-    made = rows.dropna(subset="made_for").pivot(index="made_for", columns="x", values="compliance")
+    made = made_values(rows, "compliance")
     curves = designs[INITIAL].compliance, made.iloc[1]
     return {
         "payloads": x[[0, -1]],
@@ -539,8 +545,8 @@ def _of_paths(rows: pd.DataFrame) -> dict[str, Any]:
     designs = {label: item.set_index("x") for label, item in rows.groupby("label")}
     initial, solid = designs[INITIAL], designs[SOLID].deviation
     nominal = rows.dropna(subset="made_for").label.iloc[-1]
-    made = cross_values(rows, "deviation")
-    own = pd.Series(np.diag(made), made.index)
+    made = made_values(rows, "deviation")
+    own = pd.Series(np.diag(made[made.index]), made.index)
     ratios = own / initial.deviation[own.index]
     return {
         "change_initial": span(initial.compliance),

@@ -107,10 +107,10 @@ def limits_figure(result: Result) -> Figure | None:
         used.append(Line(limit.words, iteration, share))
         gained = np.array([row.multipliers.get(limit.name, np.nan) for row in rows]) / objective
         eased.append(Line("", iteration, gained))
-    above = Panel("share of the limit that is used [%]", "iteration", "", tuple(used), y_log=True,
+    above = Panel("share of the limit that is used [%]", "iteration", "", used, y_log=True,
                   note="limit: 100 %", limits=((100.0, iteration[0], iteration[-1]),))  # fmt: skip
     words = "objective gained for 1 % of the limit [%]"
-    below = Panel(words, "iteration", "", tuple(eased), y_log=False)
+    below = Panel(words, "iteration", "", eased, y_log=False)
     return panel_figure("Limits of the design", [[above], [below]], width=WIDE)
 
 
@@ -158,8 +158,8 @@ def _distance(name: str, t: np.ndarray, distance: np.ndarray) -> Line:
 
 def _deviations(lines: Sequence[Line], scene: Scene) -> Panel:
     """Return the panel of distances, mm, and of the scene's limits of them."""
-    limits = tuple(deviation_limits(scene))
-    return Panel("", TIME, MILLIMETRES, tuple(lines), y_log=False, limits=limits)
+    limits = deviation_limits(scene)
+    return Panel("", TIME, MILLIMETRES, lines, y_log=False, limits=limits)
 
 
 def check_figure(check: Check, scene: Scene) -> Figure:
@@ -179,7 +179,7 @@ def check_figure(check: Check, scene: Scene) -> Figure:
             styles[less.label] = known[name]
             differences.append(less)
     upper = _deviations(distances, scene)
-    lower = Panel("", TIME, "difference [mm]", tuple(differences), y_log=False)
+    lower = Panel("", TIME, "difference [mm]", differences, y_log=False)
     return panel_figure(deviation_title(first), [[upper], [lower]], styles, width=WIDE)
 
 

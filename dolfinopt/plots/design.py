@@ -64,7 +64,7 @@ def design_figure(
         return _densities_figure(views, title)
     from dolfinopt.plots.solid import caption
 
-    thickest = max((MILLI * float(v.wall.max()) for v in views if v.wall is not None), default=0.0)
+    thickest = max((MILLI * v.wall.max() for v in views if v.wall is not None), default=0.0)
     marks = round_marks(thickest)
     figure, rows = _panels(views, title, thickest > 0.0)
     for axes, view in zip(rows, views, strict=True):
@@ -107,11 +107,11 @@ def stress_figure(views: Sequence[ArmView], title: str) -> Figure:
     """
     figure, rows = _panels(views, title, True)
     stresses = [MEGA * view.stress for view in views if view.stress is not None]
-    largest = max(float(stress.max()) for stress in stresses)
+    largest = max(stress.max() for stress in stresses)
     marks = round_marks(largest)
     for axes, view, stress in zip(rows, views, stresses, strict=True):
         _draw_arm(axes, view, stress, STRESS_COLOURS, marks[-1])
-        worst, when = int(np.argmax(stress)), view.stress_instant
+        worst, when = np.argmax(stress), view.stress_instant
         assert when is not None
         if stress[worst] == largest > 0.0:
             place = view.centroid[worst]
@@ -237,7 +237,7 @@ def _arm_rows(
     boxes: Sequence[Box], title: str, unit: str, foot: float
 ) -> tuple[Figure, list[Axes]]:
     """Return a figure with axes for each plane arm, inboard joints in one column."""
-    margin = MARGIN * max(float((high - low)[0]) for low, high in boxes)
+    margin = MARGIN * max((high - low)[0] for low, high in boxes)
     wider = [(low - margin, high + margin) for low, high in boxes]
     figure, rows = stacked_axes(wider, title, below=0.12, foot=foot, least=LOW)
     for axes in rows:
@@ -312,7 +312,7 @@ def boundary(corners: np.ndarray) -> np.ndarray:
     It stays the same in every deformation and place of the polygons.
     """
     flat = corners.reshape(-1, 2)
-    size = float(np.ptp(flat, axis=0).max()) or 1.0
+    size = np.ptp(flat, axis=0).max() or 1.0
     places = np.round(flat / (1e-7 * size)) @ [1.0, 1j]
     node = np.unique(places, return_inverse=True)[1].reshape(corners.shape[:2])
     edge = np.sort(sides(node), axis=1) @ [node.max() + 1, 1]

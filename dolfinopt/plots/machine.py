@@ -14,7 +14,7 @@ from PIL import Image
 from dolfinopt.disk import write_atomically
 from dolfinopt.output.design import ArmView
 from dolfinopt.plots.poses import Poses, body_poses, even_instants, shown_poses
-from dolfinopt.plots.style import GREY, ORANGE, PathLike, decimals, round_number, styled
+from dolfinopt.plots.style import GREY, ORANGE, decimals, round_number, styled
 
 if TYPE_CHECKING:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -105,7 +105,7 @@ def _name_instant(drawn: Stage, poses: Poses, n: int, words: str) -> None:
         np.stack([poses.outboard[n, 0], poses.origin[n, 0]] if loop else
                  [poses.end[n], poses.origin[n, poses.mechanism.end[0]]])
     )  # fmt: skip
-    away = (end - inner) / max(float(np.linalg.norm(end - inner)), 1e-9)
+    away = (end - inner) / max(np.linalg.norm(end - inner), 1e-9)
     drawn.axes.annotate(
         words,
         tuple(end),
@@ -172,9 +172,9 @@ def make_film(
 def _magnification(bent: Poses, rigid: Poses) -> float:
     """Return the magnification that suits how far and by what angle bodies are off."""
     pairs = [(bent.outboard, rigid.outboard), (bent.held, rigid.held), (bent.end, rigid.end)]
-    largest = max(float(np.linalg.norm(a - b, axis=-1).max()) for a, b in pairs)
+    largest = max(np.linalg.norm(a - b, axis=-1).max() for a, b in pairs)
     turned = bent.rotation - rigid.rotation
-    turn = float(np.linalg.norm(turned, axis=(-2, -1)).max()) / np.sqrt(2.0)
+    turn = np.linalg.norm(turned, axis=(-2, -1)).max() / np.sqrt(2.0)
     return round_magnification(largest, rigid.size, turn)
 
 
@@ -196,7 +196,7 @@ def round_magnification(largest: float, size: float, turn: float = 0.0) -> float
 
 
 @styled
-def draw_motion(path: PathLike, views: Sequence[ArmView], film: Film) -> Path:
+def draw_motion(path: Path, views: Sequence[ArmView], film: Film) -> Path:
     """Draw the moving, deformed machine as an animated GIF of some seconds; return its path.
 
     Args:
@@ -206,7 +206,7 @@ def draw_motion(path: PathLike, views: Sequence[ArmView], film: Film) -> Path:
     """
     count = len(film.at)
     delay = max(20.0, 10.0 * round(100.0 * FILM_SECONDS / count))  # ms; GIF counts in 10 ms
-    speed = float(np.ptp(film.t)) / (1e-3 * delay * count)
+    speed = np.ptp(film.t) / (1e-3 * delay * count)
     drawn = film_stage(views, film, speed)
     try:
         draw = frame_drawer(drawn, film)
@@ -223,12 +223,12 @@ def draw_motion(path: PathLike, views: Sequence[ArmView], film: Film) -> Path:
     finally:
         drawn.close()
     write_atomically(
-        Path(path),
+        path,
         lambda stream: first.save(
             stream, format="GIF", save_all=True, append_images=others, duration=delay, loop=0
         ),
     )
-    return Path(path)
+    return path
 
 
 def film_stage(views: Sequence[ArmView], film: Film, speed: float) -> Stage:

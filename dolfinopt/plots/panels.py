@@ -50,12 +50,12 @@ class Panel:
     title: str
     x_label: str
     y_label: str
-    lines: tuple[Line, ...]
+    lines: Sequence[Line]
     x_log2: bool = False  # numbers that are doubled rather than added to, as those of coordinates
     y_log: bool | None = None  # although the values span no decade; False: from zero, never so
     log: bool = False  # both axes
     note: str = ""  # above it on the right
-    limits: tuple[Limit, ...] = ()  # broken lines
+    limits: Sequence[Limit] = ()  # broken lines
 
 
 def draw_panel(axes: Axes, panel: Panel, styles: Looks | None = None) -> None:

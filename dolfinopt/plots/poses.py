@@ -37,7 +37,7 @@ class Poses:
 
     mechanism: Mechanism
     loops: Loops
-    parents: tuple[int, ...]
+    parents: Sequence[int]
     q_e: np.ndarray
     origin: np.ndarray
     rotation: np.ndarray
@@ -78,7 +78,7 @@ class Poses:
         """Return points (..., d) of a body with modes (..., d, q) where they are, m."""
         e = self.q_e[n, self.mechanism.slices[body]]
         moved = points + modes @ e[: modes.shape[-1]]
-        return np.asarray(moved @ self.rotation[n, body].T + self.origin[n, body])
+        return moved @ self.rotation[n, body].T + self.origin[n, body]
 
     def sites(self, body: int, n: int) -> list[np.ndarray]:
         """Return the places (d,), m, of a body that something is fixed to."""
@@ -120,7 +120,7 @@ def body_poses(
     hung = hung[: len(bodies)]
     loops, d = loops or Loops(), len(mechanism.gravity)
 
-    def over_time(values: Sequence[np.ndarray], width: tuple[int, ...]) -> np.ndarray:
+    def over_time(values: Sequence[np.ndarray], width: Sequence[int]) -> np.ndarray:
         full = [v if v.ndim > len(width) else v[..., None] for v in values]
         every = [np.broadcast_to(v, (*width, len(q_r))) for v in full]
         return np.moveaxis(np.stack(every), -1, 0)
@@ -129,7 +129,7 @@ def body_poses(
     return Poses(
         mechanism,
         loops,
-        tuple(joint.parent for joint in hung),
+        [joint.parent for joint in hung],
         q_e,
         over_time([posed.body(i)[1] for i in bodies], (d,)),
         over_time([*(posed.body(i)[2] for i in bodies), end_rotation], (d, d)),

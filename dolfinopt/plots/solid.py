@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyvista
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.output.design import ArmView
@@ -25,11 +27,6 @@ from dolfinopt.plots.style import (
     round_number,
     stacked_axes,
 )
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
@@ -184,7 +181,7 @@ def surfaces_figure(parts: Sequence[tuple[str, Surface, Sequence[str]]], title: 
 def caption(view: ArmView, mass: float | None) -> str:
     """Return what stands above a link: its size, volume and mass."""
     volumes = cell_volumes(view)
-    volume = float(volumes @ view.solid)
+    volume = volumes @ view.solid
     filled = f" ({100.0 * volume / volumes.sum():.3g} %)"
     if view.wall is not None:
         thin, thick = MILLI * view.wall.min(), MILLI * view.wall.max()
@@ -236,7 +233,7 @@ def _draw_boxed(axes: Axes, box: Box, surface: Surface, *, edges: bool, **look: 
         studio.plotter.add_mesh(lines, style="wireframe", color=GREY, lighting=False, **PLAIN)
     studio.show(studio.close())
     axes.set_axis_off()
-    (low, high), px = box, float(np.ptp(axes.get_xlim())) / axes.bbox.width  # m
+    (low, high), px = box, np.ptp(axes.get_xlim()) / axes.bbox.width  # m
     corner = LINKS.plane(np.array([low[0], low[1], high[2]]))  # at the front, below
     draw_length(axes, corner - [0.0, 30.0 * px], round_number(0.2 * (high - low)[0]), 8.0 * px)
     draw_triad(axes, LINKS, corner + np.array([-42.0, 24.0]) * px, 26.0 * px)

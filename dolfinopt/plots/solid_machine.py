@@ -70,13 +70,13 @@ class SolidStage:
         """Return where the machine stands (3,), m: as high as the world's origin, or lower."""
         first = self.poses.origin[0, self.poses.parents.index(GROUND)]
         height = np.clip(first @ self.up, 0.06 * self.size, 0.5 * self.size)
-        return np.asarray(first - height * self.up)
+        return first - height * self.up
 
     def _draw_ruler(self, low: np.ndarray, span: np.ndarray) -> None:
         """Draw a length of the plane, its lowest corner and size (2,), m, and the directions."""
         length, (x, y) = round_number(0.12 * span[0]), low + 0.03 * span
         draw_length(self.axes, np.array([x, y]), length, 0.01 * span[1])
-        arrow = 0.05 * float(span.min())
+        arrow = 0.05 * span.min()
         at = np.array([x + 0.5 * length, y + 0.05 * span[1] + arrow])
         draw_triad(self.axes, self.camera, at, arrow)
 
@@ -158,17 +158,17 @@ class SolidStage:
 def upwards(poses: Poses) -> np.ndarray:
     """Return the axis of the world (3,) that gravity points against most; z without gravity."""
     gravity = poses.mechanism.gravity[:, 0]
-    k = int(np.argmax(np.abs(gravity))) if gravity.any() else 2
-    return np.asarray((-np.sign(gravity[k]) or 1.0) * np.eye(3)[k])
+    k = np.argmax(np.abs(gravity)) if gravity.any() else 2
+    return (-np.sign(gravity[k]) or 1.0) * np.eye(3)[k]
 
 
 def camera_of(poses: Poses, up: np.ndarray) -> Camera:
     """Return the view in which the machine's places spread most."""
-    east, north = np.roll(np.eye(3), -1 - int(np.argmax(np.abs(up))), axis=0)[:2]
+    east, north = np.roll(np.eye(3), -1 - np.argmax(np.abs(up)), axis=0)[:2]
     points = np.concatenate([poses.origin, poses.outboard], axis=1).reshape(-1, 3)
     levels = np.outer(np.cos(AZIMUTHS), east) + np.outer(np.sin(AZIMUTHS), north)
     backs = np.cos(ELEVATION) * levels + np.sin(ELEVATION) * up
     cameras = [camera_from(back, up) for back in backs]
     spreads = np.linalg.det([np.cov(camera.plane(points).T) for camera in cameras])
     # Of views that spread alike the first.
-    return cameras[int(np.argmax(spreads > (1.0 - 1e-9) * spreads.max()))]
+    return cameras[np.argmax(spreads > (1.0 - 1e-9) * spreads.max())]

@@ -6,7 +6,6 @@ Matplotlib is imported where it is used: most commands draw nothing.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Sequence
 from functools import wraps
 from itertools import chain
@@ -37,7 +36,6 @@ FEW_POINTS = 40  # of a line, which gets markers
 MILLI = 1e3
 SOLID_FROM = 0.05  # density from which a cell is drawn where void is left open
 
-PathLike = str | os.PathLike[str]
 Box = tuple[np.ndarray, np.ndarray]  # lowest and highest corner
 
 
@@ -80,7 +78,7 @@ def log_scale(axes: Axes, values: np.ndarray) -> None:
     from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
     axes.set_yscale("log")
-    ratio = float(np.max(values)) / float(np.min(values))
+    ratio = np.max(values) / np.min(values)
     # A short axis would otherwise have one number, or none.
     subs = [1.0, 2.0, 5.0] if ratio < 50.0 else [1.0]
     short = MaxNLocator(5, steps=[1, 2, 2.5, 5, 10])
@@ -122,7 +120,7 @@ def mixed(colour: str, strength: float) -> str:
 
 def decimals(t: np.ndarray) -> int:
     """Return how many decimals tell the instants (n,), s, of a motion of that length: 2 or more."""
-    span = float(np.ptp(t))
+    span = np.ptp(t)
     return 2 if span == 0.0 else max(2, 2 - int(np.floor(np.log10(span))))
 
 
@@ -244,8 +242,7 @@ def colour_scale(
     figure.colorbar(shown, cax=axes, orientation="horizontal", ticks=list(marks), label=label)
 
 
-def save(figure: Figure, path: PathLike) -> Path:
+def save(figure: Figure, path: Path) -> Path:
     """Write a figure as PNG; return its path."""
-    target = Path(path)
-    write_atomically(target, lambda stream: figure.savefig(stream, format="png"))
-    return target
+    write_atomically(path, lambda stream: figure.savefig(stream, format="png"))
+    return path

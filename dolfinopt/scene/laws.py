@@ -69,8 +69,7 @@ class Law:
     def integral(self, t: np.ndarray, duration: float) -> np.ndarray:
         """Return the integral of s over time up to instants t (n,), s."""
         more = self.change.integ()(np.clip(t / duration, 0.0, 1.0))
-        result: np.ndarray = (self._derivatives(t / duration)[0] + more) * duration
-        return result
+        return (self._derivatives(t / duration)[0] + more) * duration
 
     @property
     def knots(self) -> np.ndarray:
@@ -88,8 +87,7 @@ class Law:
             axis=2
         )
         turned = u - 0.5 + result[0], 1.0 - result[1], result[2], -result[3]
-        values: np.ndarray = np.where(late, turned, result)
-        return values
+        return np.where(late, turned, result)
 
 
 def shaped(law: Law, coefficients: Sequence[float]) -> Law:

@@ -17,8 +17,7 @@ from pydantic import ValidationError
 
 from dolfinopt.data import mesh_folder
 from dolfinopt.errors import InputError
-from dolfinopt.scene import inheritance
-from dolfinopt.scene.derived import complete
+from dolfinopt.scene import completion
 from dolfinopt.scene.messages import (
     Override,
     blamed,
@@ -33,15 +32,6 @@ from dolfinopt.scene.tables.arms import SIZE_KEYS, Arm
 from dolfinopt.scene.tables.base import Refusal, input_error, loc_of, shown
 from dolfinopt.scene.tables.material import CATALOGUE
 from dolfinopt.scene.text import read_toml
-
-__all__ = [
-    "Arm",
-    "Scene",
-    "pose_scenarios",
-    "read_scene",
-    "resolve_file",
-    "scene_from_dict",
-]
 
 
 def read_scene(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> Scene:
@@ -84,12 +74,12 @@ def _default_name(source: str) -> str:
 
 def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str]) -> Scene:
     """Complete `data`, apply `overrides`, validate."""
-    tree = inheritance.copied(data)
+    tree = completion.copied(data)
     tree.setdefault("name", _default_name(source))
     tree.setdefault("material", {})  # so that the message names the first key missing in it
     check_tables(tree, source)
     told = read_old_words(tree, source)
-    inherited = inheritance.inherit(tree, Arm.model_fields)
+    inherited = completion.inherit(tree, Arm.model_fields)
     sizes = {loc for loc in inherited if loc[2] in SIZE_KEYS}
     changes = [override(tree, text, source) for text in overrides]
     for change in changes:
@@ -100,15 +90,15 @@ def _build(data: Mapping[str, Any], source: str, overrides: Iterable[str]) -> Sc
     told += read_old_words(tree, source, anew=True)
     # An override may have supplied what the first arm lacked; otherwise it changes what it names.
     required = [key for key, field in Arm.model_fields.items() if field.is_required()]
-    inherited |= inheritance.inherit(tree, required)
-    inheritance.size_rigid(tree)
-    inheritance.take_from_owners(tree, inherited)
+    inherited |= completion.inherit(tree, required)
+    completion.size_rigid(tree)
+    completion.take_from_owners(tree, inherited)
     known: dict[str, Any] = CATALOGUE.get(str(tree["material"].get("name")), {})
     tree["material"] = known | tree["material"]
     _resolve_files(tree, source, changes)
-    inheritance.drop_sizes(tree, sizes)
-    inheritance.measure_bodies(tree, inherited)
-    derived = complete(tree)
+    completion.drop_sizes(tree, sizes)
+    completion.measure_bodies(tree, inherited)
+    derived = completion.complete(tree)
     try:
         scene = Scene.model_validate(tree)
     except ValidationError as error:

@@ -477,6 +477,13 @@ def with_digests(data: Mapping[str, Any]) -> dict[str, Any]:
     return with_files(data, lambda _, file: DIGEST + file_digest(Path(file)))
 
 
+def scene_content(scene: Scene, but: frozenset[str] = frozenset()) -> dict[str, Any]:
+    """Return what a scene computes with: its values and its files' content, `but` some tables."""
+    data = with_digests(scene.to_dict())
+    without = {"name", "part", *but}
+    return {table: value for table, value in data.items() if table not in without}
+
+
 def with_relative_paths(data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return a scene's data with paths from `folder`; the package's own meshes keep their name."""
     own = mesh_folder()

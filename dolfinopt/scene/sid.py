@@ -59,7 +59,7 @@ class Taylor:
 
     Attributes:
         M0: (nrow, ncol).
-        M1: (nrow, nq, ncol), zero for order 0; files of order 0 may have nq = 0.
+        M1: (nrow, nq, ncol), zero for order 0.
         order: 0 or 1.
         structure: of M0: 0 zero, 1 diagonal, 2 symmetric, 3 general, 4 unit matrix.
         nqn: dimension of higher orders, which are not read; zero.
@@ -73,12 +73,12 @@ class Taylor:
 
     def at(self, q: np.ndarray) -> np.ndarray:
         """Return M(q) (nrow, ncol)."""
-        if self.order == 0:
-            return self.M0
         return self.M0 + np.einsum("rkc,k->rc", self.M1, q)
 
 
-def taylor(M0: np.ndarray, M1: np.ndarray | None = None, *, nq: int, structure: int) -> Taylor:
+def taylor(
+    nq: int, M0: np.ndarray, M1: np.ndarray | None = None, structure: int = GENERAL
+) -> Taylor:
     """Return the expansion of order 0, or of order 1 where M1 (nrow, nq, ncol) is given.
 
     A structure that M0 does not have is replaced: one that is zero is called so.
@@ -198,25 +198,25 @@ HEADER = ("order", "nrow", "ncol", "nq", "nqn", "structure")
 # -- named arrays, and the .npz file of them ---------------------------------------------------
 
 
-def sid_arrays(data: StandardInputData) -> dict[str, np.ndarray]:
-    """Return the data as named arrays, for an .npz file.
+def sid_arrays(data: StandardInputData) -> dict[str, Any]:
+    """Return the data as named arrays, numbers and texts, for an .npz file.
 
     `mass`, `names`, `comment`, `node_names`, `node_rframes`; of every matrix `Ct/M0` (nrow, ncol),
     `Ct/M1` (nrow, nq, ncol), `Ct/order`, `Ct/structure`, `Ct/nqn`; of a node's `node1/phi/M0`.
     """
     arrays = {
-        "mass": np.array(data.mass),
-        "names": np.array(data.names, dtype=str),
-        "comment": np.array(data.comment, dtype=str),
-        "node_names": np.array([node.name for node in data.nodes], dtype=str),
-        "node_rframes": np.array([node.rframe for node in data.nodes], dtype=str),
+        "mass": data.mass,
+        "names": data.names,
+        "comment": data.comment,
+        "node_names": [node.name for node in data.nodes],
+        "node_rframes": [node.rframe for node in data.nodes],
     }
     matrices = {name: getattr(data, name) for name in BODY}
     for k, node in enumerate(data.nodes, 1):
         matrices |= {f"node{k}/{name}": getattr(node, name) for name in NODE}
     for name, matrix in matrices.items():
         if matrix is not None:
-            arrays |= {f"{name}/{key}": np.asarray(value) for key, value in vars(matrix).items()}
+            arrays |= {f"{name}/{key}": value for key, value in vars(matrix).items()}
     return arrays
 
 
@@ -346,7 +346,7 @@ def _taylor(block: _Item, name: str, nq: int) -> Taylor:
     if count != nq and (order > 0 or count != 0):
         raise block.end.fail(f"nq = {nq} of {name}, not {count}")
     M0 = np.zeros(shape)
-    M1 = np.zeros((shape[0], count, shape[1]))
+    M1 = np.zeros((shape[0], nq, shape[1]))
     first, second = block.entries("m0", M0.shape), block.entries("m1", M1.shape)
     if second and order == 0:
         raise block.end.fail(f"no m1 in {name}, which is of order 0")

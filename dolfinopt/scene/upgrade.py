@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from itertools import zip_longest
 from typing import Any
 
@@ -14,23 +13,15 @@ from dolfinopt.errors import InputError
 from dolfinopt.scene.load import scene_from_dict
 from dolfinopt.scene.old_words import read_old_words
 from dolfinopt.scene.tables.base import rows, toml_value
-from dolfinopt.scene.text import read_toml
+from dolfinopt.scene.text import read_text, read_toml
 
 HEADER = re.compile(r"\s*\[{1,2}\s*([A-Za-z0-9_.-]+)\s*\]{1,2}\s*(#.*)?$")
 KEY = re.compile(r"\s*([A-Za-z0-9_-]+)\s*=")
 
 
-@dataclass
-class Block:
-    """A table of a file, or the keys before all tables.
-
-    Attributes:
-        path: dotted; "" of the keys before all tables.
-        lines: its text in pieces, each with its key; "" of headers, comments and blank lines.
-    """
-
-    path: str
-    lines: list[tuple[str, str]] = field(default_factory=list)
+# The text of a table in pieces, each with its key; "" of headers, comments and blank lines.
+Lines = list[tuple[str, str]]
+Block = tuple[str, Lines]  # a table's dotted path, "" of the keys before all tables
 
 
 def upgraded(source: str) -> tuple[str, list[str]]:
@@ -42,16 +33,16 @@ def upgraded(source: str) -> tuple[str, list[str]]:
     old = read_toml(source)
     before = scene_from_dict(old, source)
     new = copy.deepcopy(old)
-    told = read_old_words(new, source)
-    with open(source, encoding="utf-8-sig") as file:
-        blocks = _in_new_words(_blocks(file.read()), old, new)
-    text = "".join(piece for block in blocks for _, piece in block.lines)
+    read_old_words(new, source)
+    blocks = _in_new_words(_blocks(read_text(source, "")), old, new)
+    text = "".join(piece for _, lines in blocks for _, piece in lines)
     try:
         same = scene_from_dict(tomllib.loads(text), source) == before
     except (InputError, ValueError):
         same = False
     if not same:
-        raise InputError(f"{source}: cannot be rewritten; change by hand: {'; '.join(told)}")
+        by_hand = "; ".join(before.old_words)
+        raise InputError(f"{source}: cannot be rewritten; change by hand: {by_hand}")
     return text, list(before.old_words)
 
 
@@ -61,32 +52,30 @@ def _in_new_words(
     """Return a file's tables with the values of now; an inline table stays as it is."""
     gone = set()
     for table in {**old, **new}:
-        own = [block for block in blocks if block.path == table]
-        for row, other, block in zip_longest(rows(old, table), rows(new, table), own):
+        own = [lines for path, lines in blocks if path == table]
+        for row, other, lines in zip_longest(rows(old, table), rows(new, table), own):
             if row is None and other:  # what an older word became
                 header = f"[[{table}]]" if isinstance(new[table], list) else f"[{table}]"
-                block = Block(table, [("", f"\n{header}\n")])
-                blocks.append(block)
-            if row != other and block is not None:
+                lines = [("", f"\n{header}\n")]
+                blocks.append((table, lines))
+            if row != other and lines is not None:
                 gone |= {f"{table}.{key}" for key in row or () if key not in (other or ())}
-                _rewrite(block, row or {}, other)
-    return [block for block in blocks if block.path not in gone]
+                lines[:] = [] if other is None else _rewritten(lines, row or {}, other)
+    return [block for block in blocks if block[0] not in gone]
 
 
-def _rewrite(block: Block, row: Mapping[str, Any], other: Mapping[str, Any] | None) -> None:
-    """Change the lines of a table that hold another value now; None: the table goes."""
-    if other is None:
-        block.lines.clear()
-        return
+def _rewritten(lines: Lines, row: Mapping[str, Any], other: Mapping[str, Any]) -> Lines:
+    """Return the lines of a table with the values of `other` in place of those of `row`."""
     fresh = [key for key in other if key not in row]
-    lines = []
-    for key, text in block.lines:
+    result = []
+    for key, text in lines:
         if not key or (key in other and other[key] == row[key]):
-            lines.append((key, text))
+            result.append((key, text))
         elif key in other or fresh:  # a new key takes the place of one that goes
             name = key if key in other else fresh.pop(0)
-            lines.append((name, f"{name} = {toml_value(other[name])}{_comment(text)}\n"))
-    block.lines = [*lines[:1], *((k, f"{k} = {toml_value(other[k])}\n") for k in fresh), *lines[1:]]
+            result.append((name, f"{name} = {toml_value(other[name])}{_comment(text)}\n"))
+    more = ((key, f"{key} = {toml_value(other[key])}\n") for key in fresh)
+    return [*result[:1], *more, *result[1:]]
 
 
 def _comment(text: str) -> str:
@@ -97,15 +86,16 @@ def _comment(text: str) -> str:
 
 def _blocks(text: str) -> list[Block]:
     """Return the tables of a file; the first one holds the keys before all headers."""
-    blocks, pending = [Block("")], ""
+    blocks: list[Block] = [("", [])]
+    pending = ""
     for line in text.splitlines():
         pending += f"{line}\n"
         key = KEY.match(pending)
         if key and not _is_complete(pending):
             continue  # a value over several lines
         if header := HEADER.match(line):
-            blocks.append(Block(header[1]))
-        blocks[-1].lines.append((key[1] if key else "", pending))
+            blocks.append((header[1], []))
+        blocks[-1][1].append((key[1] if key else "", pending))
         pending = ""
     return blocks
 

@@ -153,7 +153,7 @@ def _plot(
     sides: Mapping[str, Side], title: str, label: str, y: Mapping[str, np.ndarray]
 ) -> tuple[str, bytes]:
     """Return curves of both runs over time, and their title."""
-    lines = tuple(Line(name, side.t, y[name]) for name, side in sides.items())
+    lines = [Line(name, side.t, y[name]) for name, side in sides.items()]
     panel = Panel(title, "time [s]", label, lines, y_log=False)
     stream = io.BytesIO()
     panel_figure("", [[panel]], LOOKS).savefig(stream, format="png")

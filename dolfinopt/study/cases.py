@@ -21,7 +21,7 @@ import shutil
 import time
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -47,7 +47,7 @@ from dolfinopt.progress import log
 from dolfinopt.responses.motion import worst_instants
 from dolfinopt.responses.response import bodies_in
 from dolfinopt.scene.load import Scene
-from dolfinopt.scene.schema import file_digest, program, with_digests
+from dolfinopt.scene.schema import file_digest, program, scene_content
 from dolfinopt.study import variants
 
 Action = Literal["optimize", "simulate", "sample"]
@@ -71,7 +71,7 @@ class Case:
     action: Action = "simulate"
     design: Case | Path | None = None  # given; of an optimising case, of a file, or the initial one
     label: str = ""  # what progress and messages call it
-    samples: tuple[tuple[str, ...], ...] = ()  # what each changes, "key.path=value" each
+    samples: Sequence[Sequence[str]] = ()  # what each changes, "key.path=value" each
     first: int = 0  # number of the first sample, for messages
 
     @cached_property
@@ -167,9 +167,9 @@ class Outcomes:
         return replace(self.by_case[case], case=case)
 
     @property
-    def failures(self) -> tuple[str, ...]:
+    def failures(self) -> list[str]:
         """What failed, a line each."""
-        return tuple(line for outcome in self.by_case.values() for line in outcome.failures)
+        return [line for outcome in self.by_case.values() for line in outcome.failures]
 
 
 T = TypeVar("T")
@@ -207,13 +207,6 @@ def _advance(steps: Steps[T], outcomes: Outcomes) -> tuple[Sequence[Case] | None
         return steps.send(outcomes), None
     except StopIteration as stop:
         return None, stop.value
-
-
-def scene_content(scene: Scene, but: frozenset[str] = frozenset()) -> dict[str, Any]:
-    """Return what a scene computes with: its values and its files' content, `but` some tables."""
-    data = with_digests(scene.to_dict())
-    without = {"name", "part", *but}
-    return {table: value for table, value in data.items() if table not in without}
 
 
 def _digest(content: Any) -> str:
@@ -303,8 +296,6 @@ SUMMARY, TRAJECTORY = "summary.json", "trajectory.npz"
 DEVIATION = "deviation.npz"  # t and deviation of a simulation whose other files are not kept
 IDLE = 0.02  # s between two looks for a job
 SAMPLED = ("compliance", "max_deviation", "max_deviation_time")
-FIGURES = (*SAMPLED, "objective", "grayness", "iterations", "stop_reason", "samples", "failure",
-           "failures")  # fmt: skip
 
 Job = Sequence[Case]  # of the same arms and design, which one rank builds once
 
@@ -346,7 +337,7 @@ class _Place:
         failed = self._failure(case)
         path = failed if failed.exists() else self[case] / SUMMARY
         data = json.loads(path.read_text("utf-8"))
-        known = {name: data[name] for name in FIGURES if name in data}
+        known = {item.name: data[item.name] for item in fields(Outcome) if item.name in data}
         known["seconds"] = data.get("seconds", {}).get("total", math.nan)
         return Outcome(case, self[case], **known, summary=data)
 
@@ -471,7 +462,7 @@ def _do(job: Job, place: _Place) -> None:
 
 def _optimise(case: Case, place: _Place) -> None:
     """Optimise, from the checkpoint of an interrupted run if there is one."""
-    begun, folder, scene = time.perf_counter(), place[case], _unnamed(case)
+    begun, folder, scene = time.perf_counter(), place[case], case.scene
     resume = True
     try:
         checkpoint.check(folder, scene)
@@ -489,7 +480,7 @@ def _optimise(case: Case, place: _Place) -> None:
 
 def _simulate(job: Job, design: Path | None, place: _Place) -> None:
     """Simulate one design in many scenes."""
-    results = simulate_scenarios([_unnamed(case) for case in job], design)
+    results = simulate_scenarios([case.scene for case in job], design)
     for case in job:
         place.check()
         begun = time.perf_counter()
@@ -540,9 +531,4 @@ def _sample(cases: Sequence[Case], design: Path | None, place: _Place) -> None:
             folder, wall = place[case], time.perf_counter() - begun
             make_folder(folder)
             more = {"seconds": {"total": wall}, "versions": versions(), "scene": scene.to_dict()}
-            write_summary(folder, {"name": case.key, "samples": samples, **more})
-
-
-def _unnamed(case: Case) -> Scene:
-    """Return the scene under the case's key, so that a checkpoint does not depend on a name."""
-    return case.scene.unchecked_copy({"name": case.key})
+            write_summary(folder, {"name": scene.name, "samples": samples, **more})

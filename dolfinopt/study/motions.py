@@ -22,8 +22,8 @@ from dolfinopt.arms.arm import chain_of
 from dolfinopt.disk import make_folder, write_table
 from dolfinopt.dynamics.build import build_system, desired_motion
 from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
-from dolfinopt.output.design import Designed, arms_with_design
-from dolfinopt.output.feed_forward import finer_deviation, simulated_with, with_feed_forward
+from dolfinopt.output.design import arms_with_design
+from dolfinopt.output.feed_forward import finer_deviation, with_feed_forward
 from dolfinopt.output.trajectory import drive_units
 from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -40,6 +40,7 @@ from dolfinopt.study.studies import (
 from dolfinopt.study.tables import LineFigure, Study, Table
 
 NAME = "motions"  # of the study's files, and of the folder of the shaped joints
+LONGER, FINER = "longer by [s]", "finer model [mm]"
 RIGID, FORWARD = "joints on the rigid path", "feed-forward"
 DESIGNED = "feed-forward, arms designed for it"
 SHAPERS: dict[ShaperKind, str] = {
@@ -72,10 +73,10 @@ def study_motions(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps[
         searched = [design, Case(forward, "optimize", label=DESIGNED)]
         result = yield searched
         if result.failures:
-            return Study(NAME, (), (), result.failures)
+            return Study((), (), result.failures)
         files = [result[item].design for item in searched]
     rows = _motions(scene, files, folder / NAME)
-    return (yield from reported(NAME, rows, partial(report, scene=scene)))
+    return (yield from reported(rows, partial(report, scene=scene)))
 
 
 def machines(scene: Scene) -> dict[str, str]:
@@ -93,28 +94,22 @@ def machines(scene: Scene) -> dict[str, str]:
 
 def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> Rows:
     """Return the motions with the first design, and feed-forward with the second."""
-
-    def row(
-        case: Case, longer: float = 0.0, finer: float = math.nan
-    ) -> tuple[dict[str, Any], Case]:
-        labels = {"motion": case.label, "longer by [s]": longer, "finer model [mm]": 1e3 * finer}
-        return labels, case
-
     rigid, forward = (_judged(with_feed_forward(scene, kind)) for kind in ("none", "tip"))
     first = designs[0]
     place = arms_with_design(MPI.COMM_SELF, rigid, first, Profile())
-    rows = [row(Case(rigid, "simulate", first, RIGID), finer=_finer_deviation(place))]
-    bodies = {index: arm.reduce(place.x_phys[index]) for index, arm in place.arms.items()}
-    frequency, damping_ratio = build_system(rigid, chain_of(rigid, bodies)).slowest_vibration(2)
+    finer = finer_deviation(place, None) if rigid.reduction.count else None
+    labels = {LONGER: 0.0, FINER: 1e3 * (finer or math.nan)}
+    rows: Rows = [(labels, Case(rigid, "simulate", first, RIGID))]
+    chain = chain_of(rigid, place.bodies())
+    frequency, damping_ratio = build_system(rigid, chain).slowest_vibration(2)
     if frequency > 0.0 and scene.motion.table_ends == "rest":
         for kind, label in SHAPERS.items():
             shaper = input_shaper(kind, frequency, damping_ratio)
             shaped = write_shaped(rigid, shaper, folder / f"{kind}.csv")
-            rows.append(row(Case(shaped, "simulate", first, label), shaper.longer))
+            rows.append(({LONGER: shaper.longer}, Case(shaped, "simulate", first, label)))
     for label, design in zip((FORWARD, DESIGNED), designs, strict=False):
-        place = arms_with_design(MPI.COMM_SELF, forward, design, Profile())
         case = Case(forward, "simulate", design, label)
-        rows.append(row(case, 2.0 * forward.lead, _finer_deviation(place)))
+        rows.append(({LONGER: 2.0 * forward.lead}, case))
     return rows
 
 
@@ -123,18 +118,6 @@ def _judged(scene: Scene) -> Scene:
     data = scene.to_tree()
     data["scenarios"] = [{"changes": [change]} for change in machines(scene).values()]
     return scene_from_dict(data, scene.source)
-
-
-def _finer_deviation(place: Designed) -> float:
-    """Return the largest deviation in a finer model with this one's corrections, m; or nan."""
-    scene, corrections = place.scene, None
-    if scene.feed_forward.on:
-        nominal = simulated_with(place)
-        corrections = None if nominal is None else nominal.feed_forward
-    if not scene.reduction.count or (scene.feed_forward.on and corrections is None):
-        return math.nan
-    finer = finer_deviation(place, corrections)
-    return math.nan if finer is None else finer
 
 
 def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
@@ -162,20 +145,21 @@ def write_shaped(scene: Scene, shaper: InputShaper, file: Path) -> Scene:
 def report(frame: pd.DataFrame, scene: Scene) -> Report:
     """Return the table under a sentence, and the deviations over time."""
     able = [outcome for outcome in frame["outcome"] if not outcome.failure]
-    columns = [
-        "motion",
-        "mass [kg]",
-        "longer by [s]",
-        DEVIATION,
-        "finer model [mm]",
-        "settling [mm]",
-    ]
+    columns = ["motion", "mass [kg]", LONGER, DEVIATION, FINER, "settling [mm]"]
+    frame[FINER] = frame[FINER].fillna(frame["outcome"].map(_finer))
+    frame = frame.rename(columns={"label": "motion"})
     further = pd.DataFrame(_further(scene, outcome.summary) for outcome in frame["outcome"])
     table = Table(
         "", f"{_verdict(able)} {NOTE}", with_failures(frame, frame[columns].join(further))
     )
     title = "Deviation of the tip from the path of each motion"
-    return [table], [LineFigure("deviation", title, tuple(deviation_panels(able)))]
+    return [table], [LineFigure("deviation", title, deviation_panels(able))]
+
+
+def _finer(outcome: Outcome) -> float:
+    """Return the deviation in a finer model that moves with the corrections, mm; nan without."""
+    told = outcome.summary.get("feed_forward") or {}
+    return 1e3 * (told.get("deviation_left_finer") or math.nan)
 
 
 NOTE = (

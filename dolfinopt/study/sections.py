@@ -13,7 +13,6 @@ these hold their limits, and so on.
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +29,7 @@ from dolfinopt.disk import make_folder, write_bytes
 from dolfinopt.errors import InputError
 from dolfinopt.mesh.hollow import KINDS, Section, member
 from dolfinopt.mesh.solid_cells import msh_bytes
+from dolfinopt.output.folders import read_record
 from dolfinopt.progress import with_unit
 from dolfinopt.responses.constraints import EXCESS, Limit
 from dolfinopt.scene.load import Scene, scene_from_dict
@@ -85,8 +85,7 @@ class Members:
     @property
     def arms(self) -> tuple[int, ...]:
         """Indices of the arms with a section of their own."""
-        owners = self.scene.owners
-        return tuple(k for k, owner in enumerate(owners) if owner == k)
+        return tuple(self.scene.cell_counts)
 
     def mass(self, arm: int, share: float) -> float:
         """Return the mass of one arm, kg."""
@@ -298,7 +297,7 @@ def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps
     own = Case(scene, "simulate", design, DESIGN)
     first = (yield [own])[own]
     if first.failure:
-        return Study(NAME, (), (), tuple(first.failures))
+        return Study((), (), first.failures)
     kinds = KINDS[scene.dimension].items()
     every = [Members(scene, kind, section, folder) for kind, section in kinds]
     asked: list[tuple[Members, str, Shares]] = []
@@ -312,7 +311,7 @@ def study_sections(scene: Scene, designs: Sequence[Path], folder: Path) -> Steps
         sizes = f"{members.section.named}: {members.sizes(shares)}"
         labels = {"section": members.kind, "made": sizing, "sizes [mm]": sizes}
         rows.append((labels, members.case(shares)))
-    study = yield from reported(NAME, rows, partial(report, scene=scene))
+    study = yield from reported(rows, partial(report, scene=scene))
     # A member that is too soft to be simulated is a finding, in its row, and no failure.
     return replace(study, failures=())
 
@@ -368,7 +367,7 @@ def _reached(scene: Scene, members: Members, outcome: Outcome) -> str:
 
 def _check_replaceable(scene: Scene) -> None:
     """Raise InputError where no straight member can take an arm's place."""
-    if not any(owner is not None for owner in scene.owners):
+    if not scene.cell_counts:
         raise InputError(f"{scene.source}: sections: expected arms with a design, found none")
     for index, arm in enumerate(scene.arms):
         where, angle = f"{scene.source}: arms.{arm.name}", scene.material_of(index).angle
@@ -411,7 +410,7 @@ def report(frame: pd.DataFrame, scene: Scene) -> Report:
     ]
     title = "Deviation with straight members and with the design"
     table = Table("", verdict(scene, frame), with_failures(frame, known[columns].join(limits)))
-    return [table], [LineFigure("deviation", title, tuple(deviation_panels(named)))]
+    return [table], [LineFigure("deviation", title, deviation_panels(named))]
 
 
 def verdict(scene: Scene, frame: pd.DataFrame) -> str:
@@ -447,7 +446,7 @@ def verdict(scene: Scene, frame: pd.DataFrame) -> str:
         dimension=scene.dimension,
         least=LEAST,
         most=MOST,
-        sizes=len({owner for owner in scene.owners if owner is not None}),
+        sizes=len(scene.cell_counts),
         missing=[kind for kind in KINDS[scene.dimension] if kind not in kinds],
     )
     return " ".join(text.split())
@@ -459,9 +458,9 @@ def sections_of(run: Path) -> Table | None:
     None where there is none, or of another design.
     """
     folder = run / NAME
+    asked = read_record(folder / f"{NAME}.json").get("question")
     try:
-        asked = json.loads((folder / f"{NAME}.json").read_text("utf-8"))["question"]
-        if asked["designs"] != [file_digest(run / "design.npz")]:
+        if not asked or asked["designs"] != [file_digest(run / "design.npz")]:
             return None
         title = (folder / f"{NAME}.md").read_text("utf-8").partition("\n")[0]
         return Table(NAME, title, pd.read_csv(folder / f"{NAME}.csv", keep_default_na=False))

@@ -101,8 +101,7 @@ def study(
             asked.insert(0, own)
         if not asked:
             raise InputError("sweep: name payload, flattening or coordinates, or what to --vary")
-        name = sweep_name(preset, vary)
-        return (yield from sweep_steps(scene, name, asked, designs, reoptimize))
+        return (yield from sweep_steps(scene, asked, designs, reoptimize))
     command = f"sweep {preset}" if preset == "coordinates" else f"compare {preset}s"
     if others := [item.text for item in asked if preset == "objective" or item.key != COORDINATES]:
         only = "none" if preset == "objective" else f"only {COORDINATES}"
@@ -119,11 +118,10 @@ def study(
     return (yield from coordinates_steps(scene, designs, counts))
 
 
-def reported(name: str, rows: Rows, report: Callable[[pd.DataFrame], Report]) -> Steps[Study]:
+def reported(rows: Rows, report: Callable[[pd.DataFrame], Report]) -> Steps[Study]:
     """Return the steps of a study that asks for all its cases at once.
 
     Args:
-        name: of its files.
         rows: labels by column, and the case of each.
         report: tables and figures of the frame of all rows: labels, and `results_of` the case.
     """
@@ -135,7 +133,7 @@ def reported(name: str, rows: Rows, report: Callable[[pd.DataFrame], Report]) ->
     tables, figures = report(
         pd.DataFrame({**labels, **results_of(outcomes[case])} for labels, case in rows)
     )
-    return Study(name, tuple(tables), tuple(figures), outcomes.failures)
+    return Study(tables, figures, outcomes.failures)
 
 
 def results_of(outcome: Outcome) -> dict[str, Any]:
@@ -224,12 +222,12 @@ def with_failures(frame: pd.DataFrame, table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(failed=frame["failure"]) if (frame["failure"] != "").any() else table
 
 
-def lines_by(frame: pd.DataFrame, by: str, x: str, y: str, label: str = "") -> tuple[Line, ...]:
+def lines_by(frame: pd.DataFrame, by: str, x: str, y: str, label: str = "") -> list[Line]:
     """Return columns y against x by the column `by`: a value, a number with the label before it."""
-    return tuple(
+    return [
         Line(f"{label}{value:g}" if label else str(value), part[x].to_numpy(), part[y].to_numpy())
         for value, part in frame.groupby(by, sort=False)
-    )
+    ]
 
 
 def deviation_panels(outcomes: Sequence[Outcome]) -> list[Panel]:
@@ -237,7 +235,7 @@ def deviation_panels(outcomes: Sequence[Outcome]) -> list[Panel]:
     panels = []
     for group in magnitudes(outcomes, lambda outcome: outcome.max_deviation, 10.0)[::-1]:
         curves = ((item.case.label, *item.deviation()) for item in group)
-        lines = tuple(Line(label, t, 1e3 * distance) for label, t, distance in curves)
+        lines = [Line(label, t, 1e3 * distance) for label, t, distance in curves]
         panels.append(Panel("", "time [s]", "deviation [mm]", lines))
     return panels
 
@@ -248,7 +246,7 @@ def design_figure(name: str, title: str, outcomes: Sequence[Outcome]) -> DesignF
     for item in outcomes:
         figures = f"{item.compliance:.4g} N m, {1e3 * item.max_deviation:.4g} mm"
         designs.append((f"{item.case.label}: {figures}", item.case.scene, item.design))
-    return DesignFigure(name, title, tuple(designs))
+    return DesignFigure(name, title, designs)
 
 
 def magnitudes(
@@ -268,7 +266,7 @@ def magnitudes(
 
 
 def sweep_steps(
-    scene: Scene, name: str, asked: Sequence[Vary], designs: Sequence[Path], reoptimize: bool
+    scene: Scene, asked: Sequence[Vary], designs: Sequence[Path], reoptimize: bool
 ) -> Steps[Study]:
     """Return the steps of one key, two in a grid, or more, each alone.
 
@@ -291,13 +289,13 @@ def sweep_steps(
     grids = [asked] if len(asked) <= 2 else [[entry] for entry in asked]
     rows = [row for keys in grids for row in _sweep(scene, keys, given, reoptimize, not resized)]
     if len(grids) == 1:
-        return reported(name, rows, partial(_sweep_report, keys=tuple(asked)))
+        return reported(rows, partial(_sweep_report, keys=asked))
     rows += [
         ({"role": "base", "design": label},
          Case(scene, "simulate", design, f"{label}, as it is"))
         for label, design in given.items()
     ]  # fmt: skip
-    return reported(name, rows, partial(_several, keys=tuple(asked)))
+    return reported(rows, partial(_several, keys=asked))
 
 
 def _sweep(
@@ -346,7 +344,7 @@ def _sweep_report(frame: pd.DataFrame, keys: Sequence[Vary], prefix: str = "") -
     return [Table(prefix, title, table), *tables], [curves, *figures]
 
 
-def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[Panel, ...]:
+def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> list[Panel]:
     """Return panels by quantity; designs share one where they are of one magnitude."""
     names, x = list(shown["design"].unique()), keys[0].axis
     by, label, groups = "design", "", [[name] for name in names]
@@ -359,7 +357,7 @@ def _sweep_panels(shown: pd.DataFrame, keys: Sequence[Vary]) -> tuple[Panel, ...
     for group in groups:
         own, title = shown[shown["design"].isin(group)], group[0] if len(group) == 1 else ""
         panels += [Panel(title, x, y, lines_by(own, by, x, y, label)) for y in QUANTITIES]
-    return tuple(panels)
+    return panels
 
 
 def _cross(
@@ -440,7 +438,7 @@ def objective_steps(scene: Scene, kinds: Sequence[str] = ()) -> Steps[Study]:
         except InputError:  # the scene excludes it, as passive ends do "nothing attached"
             continue
     report = partial(_objectives, weights=scene.objective.effort_weights)
-    return reported("objective", [({}, case) for case in cases], report)
+    return reported([({}, case) for case in cases], report)
 
 
 def _objectives(frame: pd.DataFrame, weights: Sequence[float] | None) -> Report:
@@ -472,7 +470,7 @@ def coordinates_steps(
     for (label, design), other in product(given_designs(scene, designs).items(), scenes):
         case = Case(other, "simulate", design, f"{label}, {reduction_name(other)}")
         rows.append(({"design": label, **_reduction(other)}, case))
-    return reported("coordinates", rows, _coordinates)
+    return reported(rows, _coordinates)
 
 
 def _reduction(scene: Scene) -> dict[str, Any]:
@@ -482,11 +480,11 @@ def _reduction(scene: Scene) -> dict[str, Any]:
 def _coordinates(frame: pd.DataFrame) -> Report:
     title = "Given designs against the number of elastic coordinates of each arm."
     x = "elastic coordinates of each arm [-]"
-    panels = tuple(
+    panels = [
         Panel(str(label), x, y, lines_by(item, "method", "coordinates", y), x_log2=True)
         for label, item in frame.groupby("design", sort=False)
         for y in QUANTITIES
-    )
+    ]
     table = Table("", title, by_design(frame, ["method", "coordinates"]))
     return [table], [LineFigure("", title, panels)]
 
@@ -501,7 +499,7 @@ def reduction_steps(scene: Scene, counts: Sequence[int] | None) -> Steps[Study]:
         again = Case(reference, "simulate", optimised, f"{optimised.label} in {called}")
         rows += [(_reduction(other) | {"role": "own"}, optimised)]
         rows += [(_reduction(other) | {"role": "again"}, again)]
-    return reported("reduction", rows, partial(_reductions, called=called))
+    return reported(rows, partial(_reductions, called=called))
 
 
 def _reductions(frame: pd.DataFrame, called: str) -> Report:

@@ -6,6 +6,7 @@ import base64
 import hashlib
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -63,7 +64,7 @@ class LineFigure:
 
     name: str
     title: str
-    panels: tuple[Panel, ...]
+    panels: Sequence[Panel]
 
     def csv(self) -> str:
         """Return all curves: a row a point."""
@@ -83,7 +84,7 @@ class DesignFigure:
 
     name: str
     title: str
-    designs: tuple[tuple[str, Scene, Path], ...]
+    designs: Sequence[tuple[str, Scene, Path]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,31 +107,32 @@ Figure = LineFigure | DesignFigure | FrameFigure
 class Study:
     """What a study found."""
 
-    name: str  # of its files
-    tables: tuple[Table, ...]  # the main one first
-    figures: tuple[Figure, ...]
-    failures: tuple[str, ...] = ()  # one line each
+    tables: Sequence[Table]  # the main one first
+    figures: Sequence[Figure]
+    failures: Sequence[str] = ()  # one line each
 
-    @property
-    def files(self) -> dict[str, Figure]:
-        """The figures by their files' names, <study>[_<figure>]."""
-        return {joined(self.name, figure.name): figure for figure in self.figures}
+    def files(self, name: str) -> dict[str, Figure]:
+        """Return the figures by their files' names, <name>[_<figure>]."""
+        return {joined(name, figure.name): figure for figure in self.figures}
 
     def markdown(self) -> str:
         """Return all tables but the long ones."""
         return "\n".join(table.markdown() for table in self.tables if not table.long)
 
 
-def write_study(study: Study, folder: Path) -> list[Path]:
-    """Write all tables as CSV and Markdown, and the curves as CSV (root only); return the paths."""
-    texts = {f"{joined(study.name, table.name)}.csv": table.csv() for table in study.tables}
-    for name, figure in study.files.items():
+def write_study(study: Study, name: str, folder: Path) -> list[Path]:
+    """Write all tables as CSV and Markdown, and the curves as CSV (root only); return the paths.
+
+    `name` begins the names of all files.
+    """
+    texts = {f"{joined(name, table.name)}.csv": table.csv() for table in study.tables}
+    for drawn, figure in study.files(name).items():
         if isinstance(figure, LineFigure):
-            texts[f"{name}_curves.csv"] = figure.csv()
-    texts[f"{study.name}.md"] = study.markdown()
-    for name, text in texts.items():
-        write_text(folder / name, text)
-    return [folder / name for name in texts]
+            texts[f"{drawn}_curves.csv"] = figure.csv()
+    texts[f"{name}.md"] = study.markdown()
+    for file, text in texts.items():
+        write_text(folder / file, text)
+    return [folder / file for file in texts]
 
 
 def file_name(*parts: str) -> str:

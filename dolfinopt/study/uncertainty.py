@@ -88,16 +88,11 @@ class Distribution:
         return np.clip(self.law.ppf(first + shares * (last - first)), self.low, self.high)
 
     @property
-    def mean(self) -> float:
-        """Its expectation."""
+    def moments(self) -> tuple[float, float]:
+        """Its expectation and standard deviation."""
         x, weights = self._quadrature
-        return float(weights @ x)
-
-    @property
-    def deviation(self) -> float:
-        """Its standard deviation."""
-        x, weights = self._quadrature
-        return float(np.sqrt(weights @ (x - self.mean) ** 2))
+        mean = weights @ x
+        return float(mean), float(np.sqrt(weights @ (x - mean) ** 2))
 
     @cached_property
     def _quadrature(self) -> tuple[np.ndarray, np.ndarray]:
@@ -241,10 +236,7 @@ def polynomial_indices(
         return Indices(none, none, 0, 0.0)
     degrees = [p for p in range(1, MAX_DEGREE + 1)
                if math.comb(dimensions + p, p) <= n / SAMPLES_A_TERM] or [1]  # fmt: skip
-    single = [
-        distribution.polynomials(samples[:, i], degrees[-1])
-        for i, distribution in enumerate(distributions)
-    ]
+    single = [law.polynomials(x, degrees[-1]) for law, x in zip(distributions, samples.T)]
     fits = []
     for degree in degrees:
         chosen = combinations_with_replacement(range(dimensions + 1), degree)  # the last is 1
@@ -353,7 +345,7 @@ def study_random(
         for case in sample_cases(nominal, texts, label, design)
     ]
     report = partial(_report, inputs=inputs, values=values)
-    return (yield from reported(random_name(random), rows, report))
+    return (yield from reported(rows, report))
 
 
 def random_name(random: Sequence[str]) -> str:
@@ -361,20 +353,20 @@ def random_name(random: Sequence[str]) -> str:
     return file_name("uncertainty", *(text.partition("=")[0].strip() for text in random))
 
 
-def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[tuple[str, ...]]:
+def sample_texts(keys: Sequence[str], values: np.ndarray) -> list[Sequence[str]]:
     """Return what makes each sample of the scene, as "key=value": nothing, and values (n, d)."""
-    rows = [tuple(f"{key}={v!r}" for key, v in zip(keys, row)) for row in values.tolist()]
-    return [(), *rows]
+    rows = [[f"{key}={v!r}" for key, v in zip(keys, row)] for row in values.tolist()]
+    return [[], *rows]
 
 
 def sample_cases(
-    scene: Scene, samples: Sequence[tuple[str, ...]], label: str, design: Design
+    scene: Scene, samples: Sequence[Sequence[str]], label: str, design: Design
 ) -> list[Case]:
     """Return the cases of one design: an interruption costs one, more samples leave them be."""
     keys = {change.partition("=")[0] for sample in samples for change in sample}
     size = CHUNK if scales_bodies(scene, keys) else REDUCED
     return [
-        Case(scene, "sample", design, label, tuple(samples[first : first + size]), first)
+        Case(scene, "sample", design, label, samples[first : first + size], first)
         for first in range(0, len(samples), size)
     ]
 
@@ -476,7 +468,7 @@ def _input_table(inputs: Sequence[Input]) -> Table:
     for item in inputs:
         law = item.distribution
         cut = round(100.0 * law.cut_off, 6)
-        rows.append((item.axis, law.text, item.nominal, law.mean, law.deviation, cut))
+        rows.append((item.axis, law.text, item.nominal, *law.moments, cut))
     columns = "input", "distribution", "nominal", "mean", "standard deviation", "cut off [%]"
     title = "Random values, independent of one another, cut off where the key's range ends."
     return Table("inputs", title, pd.DataFrame(rows, columns=columns))

@@ -142,7 +142,7 @@ def test_members_of_a_robust_design_are_as_wide_as_asked():
     width, cell = 0.012, 0.06 / 18
     asked = f"design.minimum_member={width}", "design.erosion=0.25"
     result = do.optimize(do.load_scene(TWO_ARM, (*ROBUST, *asked)))
-    widths = _widths(result.partition, result.arms, result.x_phys)
+    widths = _widths(result.scene, result.partition, result.arms, result.x_phys)
     volume = WORLD.bcast(result.history[-1].volume_fraction if WORLD.rank == 0 else None, root=0)
     assert volume == pytest.approx(0.5, abs=0.01)  # of the nominal design
     if WORLD.rank == 0:
@@ -284,7 +284,7 @@ def test_widths_of_solid_arms_are_measured_where_they_are_asked_for(extruded):
         partition = do.partition_arms(MPI.COMM_SELF, {0: 480})
         x, y = arm.mesh.centroid.T[:2]
         solid = (x < 0.05) | (x > 0.45) | (np.abs(y) > 0.015)  # flanges of three cells
-        found = _widths(partition, {0: arm}, {0: solid * 1.0})
+        found = _widths(one, partition, {0: arm}, {0: solid * 1.0})
         if one is scene:
             assert found == {}
             continue
@@ -293,5 +293,5 @@ def test_widths_of_solid_arms_are_measured_where_they_are_asked_for(extruded):
         assert member.size == pytest.approx(0.015 if extruded else 0.01, abs=0.003)
         assert gap is None or gap.size > 0.02
         assert not (extruded and member.fixed)  # the whole arm is as thin otherwise
-        stub = _widths(partition, {0: arm}, {0: arm.mesh.passive * 1.0})[0][0]
+        stub = _widths(one, partition, {0: arm}, {0: arm.mesh.passive * 1.0})[0][0]
         assert stub.fixed  # nothing but the solid ends

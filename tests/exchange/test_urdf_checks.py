@@ -243,7 +243,7 @@ def test_meshes_are_found_in_their_package(tmp_path, monkeypatch, how):
     assert not link.missing and link.volume == pytest.approx(1.0)
     if how == "ROS_PACKAGE_PATH":
         monkeypatch.delenv(how)
-        assert read_robot(file).links["b"].missing == ("mesh package://arm/meshes/a.stl not found",)
+        assert read_robot(file).links["b"].missing == ["mesh package://arm/meshes/a.stl not found"]
 
 
 def test_a_mesh_whose_name_differs_by_capitals_is_named(tmp_path):
@@ -252,9 +252,9 @@ def test_a_mesh_whose_name_differs_by_capitals_is_named(tmp_path):
     (tmp_path / "meshes" / "arm.stl").write_bytes(b"")
     file = tmp_path / "r.urdf"
     file.write_text(f'<robot name="r"><link name="a">{mesh}</link></robot>')
-    assert read_robot(file).links["a"].missing == (
-        "mesh meshes/Arm.STL not found; there is arm.stl",
-    )
+    assert read_robot(file).links["a"].missing == [
+        "mesh meshes/Arm.STL not found; there is arm.stl"
+    ]
 
 
 def test_a_loop_is_told_where_to_stand(tmp_path):

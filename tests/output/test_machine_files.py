@@ -56,7 +56,7 @@ def test_control_leaves_desired_and_actual_coordinates_and_its_forces(tmp_path):
         away = np.abs(trajectory.q_r[:, k] - trajectory.desired.q[:, k]).max()
         assert summary["drive_error_peak"][name] == pytest.approx(away)
         assert np.abs(error[:, k]).max() < away
-    assert "closure_force_peak" not in summary and "closure_force" not in arrays
+    assert "closure_peak" not in summary and "closure_force" not in arrays
     # The real end-effector from the desired path, the semicircle of 1 m: at rest in the end.
     place = sampled.end - arrays["deviation"]
     np.testing.assert_allclose(np.hypot(*place.T), 1.0, atol=1e-12)
@@ -80,7 +80,7 @@ def test_slider_leaves_its_place_and_the_force_of_its_guide(tmp_path):
     np.testing.assert_allclose(arrays["deviation"][:, 0], away, atol=1e-12)
     assert np.abs(arrays["deviation"][:, 1]).max() < 1e-8
     peak = np.abs(trajectory.closure_force).max()
-    assert summary["closure_force_peak"] == pytest.approx(peak, rel=1e-12)
+    assert summary["closure_peak"]["closure"]["N"] == pytest.approx(peak, rel=1e-12)
 
 
 @pytest.mark.serial
@@ -109,7 +109,7 @@ def test_pin_leaves_its_force_along_x_and_y(tmp_path):
     assert "slider_position" not in arrays
     assert list(summary["drive_peak"]) == ["crank"]
     largest = np.hypot(*arrays["closure_force"].T).max()
-    assert summary["closure_force_peak"] == pytest.approx(largest, rel=1e-12)
+    assert summary["closure_peak"]["closure"]["N"] == pytest.approx(largest, rel=1e-12)
     assert summary["max_deviation"] < 1e-7  # m: the end is pinned
     assert summary["stiffening"]["on"] in (True, False)
 

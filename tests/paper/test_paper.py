@@ -25,7 +25,7 @@ from dolfinopt.paper.reproduction import (
     power,
     span,
 )
-from dolfinopt.study.cases import Case, Outcomes
+from dolfinopt.study.cases import Case, Outcomes, Runner
 
 pytestmark = pytest.mark.serial  # cases are dealt out to ranks in tests/study
 
@@ -196,8 +196,8 @@ def whole(tmp_path_factory):
     folder, kept = tmp_path_factory.mktemp("paper"), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "Plan", tiny)
-        keep = paper.reproduce
-        patch.setattr(paper, "reproduce", lambda *given: kept.append(keep(*given)) or kept[-1])
+        follow = Runner.follow
+        patch.setattr(Runner, "follow", lambda *given: kept.append(follow(*given)) or kept[-1])
         run("reproduce", "--out", folder, *overrides(*TINY))
         return folder, kept[-1]
 

@@ -215,7 +215,7 @@ def _check_mimics(file: Path, joints: list[RobotJoint]) -> None:
 
 def _ordered(
     file: Path, links: list[str], joints: list[RobotJoint]
-) -> tuple[str, tuple[RobotJoint, ...]]:
+) -> tuple[str, list[RobotJoint]]:
     """Return the root's name, and the joints with every one behind its parent's."""
     for joint in joints:
         for word, name in (("parent", joint.parent), ("child", joint.child)):
@@ -242,7 +242,7 @@ def _ordered(
         result.append(first)
         placed.add(first.child)
         waiting.remove(first)
-    return roots[0], tuple(result)
+    return roots[0], result
 
 
 # -- links -----------------------------------------------------------------------------------
@@ -264,15 +264,13 @@ def _link(file: Path, xml: Any) -> RobotLink:
     )
     shapes, missing = _shapes(file, collisions or visuals)
 
-    def visual() -> tuple[Trimesh, ...]:
+    def visual() -> list[Trimesh]:
         return _shapes(file, visuals)[0]
 
     return RobotLink(name, inertia, shapes, missing, visual if collisions and visuals else None)
 
 
-def _shapes(
-    file: Path, elements: Sequence[_Element]
-) -> tuple[tuple[Trimesh, ...], tuple[str, ...]]:
+def _shapes(file: Path, elements: Sequence[_Element]) -> tuple[list[Trimesh], list[str]]:
     """Return the surfaces of a link's elements in its frame, and meshes that cannot be read."""
     shapes, missing = [], []
     for element in elements:
@@ -283,7 +281,7 @@ def _shapes(
             continue
         shape.apply_transform(element.pose)
         shapes.append(shape)
-    return tuple(shapes), tuple(missing)
+    return shapes, missing
 
 
 def _shape(file: Path, element: _Element) -> Trimesh:

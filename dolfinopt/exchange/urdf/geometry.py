@@ -13,18 +13,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pyvista
+import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
+from trimesh import Trimesh, boolean, creation, repair
 
 from dolfinopt.exchange.urdf.robot import CELLS, FEWEST, SceneBody, inverse
 from dolfinopt.mesh.checks import corner_jacobians
 from dolfinopt.mesh.solid_cells import TENSOR, boundary
-
-if TYPE_CHECKING:
-    from trimesh import Trimesh
 
 MOST = 20000  # of one with thin walls
 FINE = 3  # voxels along the side of a cell
@@ -72,7 +72,7 @@ class LinkCells:
     inboard: np.ndarray
     outboard: np.ndarray
     side: float
-    done: tuple[str, ...] = ()
+    done: Sequence[str] = ()
 
     @property
     def volume(self) -> float:
@@ -82,7 +82,7 @@ class LinkCells:
     @property
     def extents(self) -> np.ndarray:
         """Extents (3,) along the axes of the arm's frame, m."""
-        return np.asarray(np.ptp(self.points, axis=0))
+        return np.ptp(self.points, axis=0)
 
     def ends_within(self, distance: float) -> float:
         """Return the volume of the cells whose middle is nearer to an interface, m3."""
@@ -99,17 +99,13 @@ class LinkCells:
         return float(np.linalg.norm(middles, axis=1).max())
 
 
-def _image(shape: tuple[int, ...], step: float, first: np.ndarray) -> Any:
+def _image(shape: Sequence[int], step: float, first: np.ndarray) -> Any:
     """Return PyVista's image whose points are the middles of voxels, the first one at `first`."""
-    import pyvista
-
     return pyvista.ImageData(dimensions=shape, spacing=(step,) * 3, origin=first)
 
 
 def _nearest_places(solid: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return distances (n,) from a surface, m, and the nearest places (n, 3) on it."""
-    import pyvista
-
     surface: Any = pyvista.wrap(solid)
     _, places = surface.find_closest_cell(points, return_closest_point=True)
     return np.linalg.norm(points - places, axis=1), np.asarray(places)
@@ -117,10 +113,8 @@ def _nearest_places(solid: Trimesh, points: np.ndarray) -> tuple[np.ndarray, np.
 
 def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]:
     """Return the closed surface of what open pieces enclose, together with closed ones; or none."""
-    import trimesh
-
     whole: Any = trimesh.util.concatenate([*closed, *left])
-    step, radius = float(np.ptp(whole.bounds, axis=0).max()) / SHELL, round(GAP * SHELL)
+    step, radius = np.ptp(whole.bounds, axis=0).max() / SHELL, round(GAP * SHELL)
     grid, margin = whole.voxelized(step, max_iter=20), radius + 2  # for closing and opening
     shell = np.pad(grid.matrix, margin)
     shell = ndimage.binary_dilation(shell, iterations=radius)
@@ -133,7 +127,7 @@ def _within(left: Sequence[Trimesh], closed: Sequence[Trimesh]) -> list[Trimesh]
     image = _image(shell.shape, step, grid.translation - margin * step)
     image["inside"] = inside.ravel(order="F")
     surface = image.contour([SURFACE], "inside")
-    result = trimesh.Trimesh(surface.points, surface.regular_faces)
+    result = Trimesh(surface.points, surface.regular_faces)
     _turn_outwards(result)
     return [result]
 
@@ -163,7 +157,7 @@ def cells_between_joints(shapes: Sequence[Trimesh], body: SceneBody) -> LinkCell
         notes.append("not cut at the joints: rigid where it is nearest to them")
         ends = None
     joints = np.array([[0.0, 0.0, 0.0], [body.length, 0.0, 0.0]])
-    away = float(_nearest_places(piece, joints)[0].max())
+    away = _nearest_places(piece, joints)[0].max()
     if away > NEAR * max(np.ptp(piece.bounds, axis=0).max(), body.length):
         raise NoSolid(f"its geometry is {away:.3g} m away from a joint")
     if share < KEPT_ALL:
@@ -196,8 +190,6 @@ def _thin_walls(solid: Trimesh, cells: LinkCells) -> list[str]:
 
 def _united(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> tuple[Trimesh, list[str]]:
     """Return what surfaces enclose, transformed, as one, and what was done to close them."""
-    from trimesh import boolean
-
     if not shapes:
         raise NoSolid("it has no geometry")
     closed: list[Trimesh] = []
@@ -205,7 +197,7 @@ def _united(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> tuple[Trimesh, lis
     left: list[Trimesh] = []
     filled = turned = dropped = 0
     every = [_tidy(piece, to_arm) for piece in shapes]
-    size = max(float(np.ptp(np.vstack([piece.bounds for piece in every]), axis=0).max()), 1e-9)
+    size = max(np.ptp(np.vstack([piece.bounds for piece in every]), axis=0).max(), 1e-9)
     for shape in every:
         if shape.is_volume and shape.body_count == 1:
             closed.append(shape)
@@ -223,7 +215,7 @@ def _united(shapes: Sequence[Trimesh], to_arm: np.ndarray) -> tuple[Trimesh, lis
                     piece.invert()
                     hollows.append(piece)
                 else:
-                    turned += int(_turn_outwards(piece))
+                    turned += _turn_outwards(piece)
                     (closed if piece.is_volume else left).append(piece)
             elif (mended := _with_holes_closed(piece)) is not None:
                 filled += 1
@@ -254,9 +246,7 @@ def _pieces_of(count: int) -> str:
 
 def _tidy(shape: Trimesh, to_arm: np.ndarray) -> Trimesh:
     """Return a surface in the arm's frame: corners merged, no triangle twice or without area."""
-    import trimesh
-
-    result = trimesh.Trimesh(shape.vertices, shape.faces, process=True)
+    result = Trimesh(shape.vertices, shape.faces, process=True)
     result.merge_vertices(merge_tex=True, merge_norm=True)
     result.update_faces(result.nondegenerate_faces())
     result.update_faces(result.unique_faces())
@@ -277,8 +267,6 @@ def _lies_in_another(piece: Trimesh, pieces: Sequence[Trimesh]) -> bool:
 
 def _turn_outwards(piece: Trimesh) -> bool:
     """Turn the triangles of a closed piece outwards; return whether there was need to."""
-    from trimesh import repair
-
     if piece.is_winding_consistent and piece.volume > 0.0:
         return False
     repair.fix_winding(piece)
@@ -289,13 +277,10 @@ def _turn_outwards(piece: Trimesh) -> bool:
 
 def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
     """Return a piece with its holes closed by VTK; None where it stays open."""
-    import pyvista
-    import trimesh
-
-    wide = 10.0 * float(np.ptp(piece.bounds, axis=0).max())
+    wide = 10.0 * np.ptp(piece.bounds, axis=0).max()
     surface = pyvista.wrap(piece)
     filled = surface.fill_holes(wide).triangulate()
-    closed = trimesh.Trimesh(filled.points, filled.regular_faces, process=True)
+    closed = Trimesh(filled.points, filled.regular_faces, process=True)
     if not closed.is_watertight or len(closed.faces) < 4:
         return None
     _turn_outwards(closed)
@@ -308,7 +293,7 @@ def _with_holes_closed(piece: Trimesh) -> Trimesh | None:
 def _connected(mask: np.ndarray) -> np.ndarray:
     """Return the largest connected part of what is True."""
     labels, _ = ndimage.label(mask)
-    return np.asarray(labels == 1 + int(np.bincount(labels.ravel())[1:].argmax()))
+    return labels == 1 + np.bincount(labels.ravel())[1:].argmax()
 
 
 def _ends(link: Trimesh, length: float) -> np.ndarray | None:
@@ -322,10 +307,8 @@ def _ends(link: Trimesh, length: float) -> np.ndarray | None:
 
 def _largest(solid: Trimesh) -> tuple[Trimesh, float]:
     """Return the largest body of a solid, with its cavities, and its share of the volume."""
-    import trimesh
-
     parts = list(solid.split(only_watertight=False, repair=False))
-    outer = max(parts, key=lambda part: float(part.volume))
+    outer = max(parts, key=lambda part: part.volume)
     inner = [part for part in parts if part.volume < 0.0 and _lies_in_another(part, [outer])]
     body: Any = trimesh.util.concatenate([outer, *inner])
     return body, float(body.volume / solid.volume)
@@ -336,8 +319,6 @@ def _between(link: Trimesh, ends: np.ndarray) -> tuple[Trimesh, float] | None:
 
     None without one, and where most of the link lies elsewhere.
     """
-    from trimesh import boolean, creation
-
     wider = link.bounds + np.array([[-1.0], [1.0]])
     wider[:, 0] = ends
     cut = boolean.intersection([link, creation.box(bounds=wider)], check_volume=False)
@@ -359,10 +340,8 @@ def _cells(
     length: float,
 ) -> LinkCells | None:
     """Return the cells of about a side; None where they are too coarse for the walls."""
-    import pyvista
-
     low, high = piece.bounds.copy()
-    side = min(side, float((high - low)[1:].min()) / FEWEST)
+    side = min(side, (high - low)[1:].min() / FEWEST)
     if ends is not None:
         low[0], high[0] = ends
         side = (ends[1] - ends[0]) / max(FEWEST, round((ends[1] - ends[0]) / side))
@@ -439,7 +418,7 @@ def _on_surface(
     while (bad := _jacobians(points + shift, cells).min(axis=1) < LEAST * side**3).any():
         shift[np.unique(cells[bad])] *= EASED if tries < 20 else 0.0
         tries += 1
-    return np.asarray(points + shift)
+    return points + shift
 
 
 def _jacobians(points: np.ndarray, cells: np.ndarray) -> np.ndarray:

@@ -136,9 +136,9 @@ class RobotLink:
 
     name: str
     inertia: Inertia
-    shapes: tuple[Trimesh, ...]
-    missing: tuple[str, ...] = ()
-    visual: Callable[[], tuple[Trimesh, ...]] | None = None
+    shapes: Sequence[Trimesh]
+    missing: Sequence[str] = ()
+    visual: Callable[[], Sequence[Trimesh]] | None = None
 
     @cached_property
     def volume(self) -> float:
@@ -175,7 +175,7 @@ class Robot:
     name: str
     file: Path
     links: dict[str, RobotLink]
-    joints: tuple[RobotJoint, ...]
+    joints: Sequence[RobotJoint]
     root: str
 
     @cached_property
@@ -184,21 +184,21 @@ class Robot:
         return {joint.child: joint for joint in self.joints}
 
     @cached_property
-    def movable(self) -> tuple[RobotJoint, ...]:
+    def movable(self) -> list[RobotJoint]:
         """The joints with a coordinate."""
-        return tuple(joint for joint in self.joints if joint.moves)
+        return [joint for joint in self.joints if joint.moves]
 
     def children(self, link: str) -> list[RobotJoint]:
         """Return the joints on a link."""
         return [joint for joint in self.joints if joint.parent == link]
 
-    def path(self, link: str) -> tuple[RobotJoint, ...]:
+    def path(self, link: str) -> list[RobotJoint]:
         """Return the joints from the ground to a link."""
         result: list[RobotJoint] = []
         while link != self.root:
             result.insert(0, self.holder[link])
             link = result[0].parent
-        return tuple(result)
+        return result
 
 
 # -- frames ----------------------------------------------------------------------------------
@@ -310,7 +310,7 @@ def _across(x: np.ndarray, *axes: np.ndarray) -> np.ndarray:
     """Return the direction across x that is nearest to the first axis with one, z or y."""
     result = (axis - (axis @ x) * x for axis in (*axes, *np.eye(3)[:0:-1]))
     across = next(item for item in result if np.linalg.norm(item) > 0.1)
-    return np.asarray(across / float(np.linalg.norm(across)))
+    return across / np.linalg.norm(across)
 
 
 # -- bodies and joints of a scene from a robot: chosen links become solids, the others are rigid
@@ -346,7 +346,7 @@ class SceneBody:
     """
 
     link: str
-    links: tuple[str, ...]
+    links: Sequence[str]
     joint: RobotJoint
     parent: str
     pose: np.ndarray
@@ -369,9 +369,7 @@ class SceneBody:
         return self.frame @ pose_of(np.eye(3), np.array([self.length, 0.0, 0.0]))
 
 
-def scene_bodies(
-    robot: Robot, chosen: tuple[str, ...], tool: str | None = None
-) -> tuple[SceneBody, ...]:
+def scene_bodies(robot: Robot, chosen: Sequence[str], tool: str | None = None) -> list[SceneBody]:
     """Return the bodies of a scene, every one behind its parent, the end-effector's last.
 
     Args:
@@ -394,7 +392,7 @@ def scene_bodies(
             frame, *box = solid_of(robot, link, tool)
         parent, at = places[joint.parent]
         outboard = bodies[parent].outboard if parent in bodies else np.eye(4)
-        links = tuple(name for name, (other, _) in places.items() if other == link)
+        links = [name for name, (other, _) in places.items() if other == link]
         total = MASSLESS
         for name in (link,) if box else links:
             total = total + robot.links[name].inertia.posed(places[name][1])
@@ -406,11 +404,11 @@ def scene_bodies(
         name, still = f"{tool}_end", np.eye(4)
         joint = RobotJoint(name, "fixed", tool, name, still, still[0, :3])
         end = SceneBody(name, (), joint, tool, still, joint.axis, MASSLESS, still)
-        return (*bodies.values(), end)
-    return tuple(sorted(bodies.values(), key=lambda item: item.link == tool))
+        return [*bodies.values(), end]
+    return sorted(bodies.values(), key=lambda item: item.link == tool)
 
 
-def _check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> None:
+def _check_links(robot: Robot, chosen: Sequence[str], tool: str | None) -> None:
     """Raise InputError unless the links that become solids, and the tool's, are there."""
     for name in (*chosen, tool) if tool is not None else chosen:
         if name not in robot.links:
@@ -425,7 +423,7 @@ def _check_links(robot: Robot, chosen: tuple[str, ...], tool: str | None) -> Non
         raise InputError(f"{robot.file}: {', '.join(chosen)}: a link is named twice")
 
 
-def default_tool(robot: Robot, chosen: tuple[str, ...]) -> str:
+def default_tool(robot: Robot, chosen: Sequence[str]) -> str:
     """Return the link at the end of the longest chain from the last of the chosen links.
 
     Frames come first: links without mass on a fixed joint, such as a tool's centre point.
@@ -447,9 +445,7 @@ def default_tool(robot: Robot, chosen: tuple[str, ...]) -> str:
     return max(ends, key=reach)
 
 
-def places_of(
-    robot: Robot, chosen: tuple[str, ...], tool: str
-) -> dict[str, tuple[str, np.ndarray]]:
+def places_of(robot: Robot, chosen: Sequence[str], tool: str) -> dict[str, tuple[str, np.ndarray]]:
     """Return of every link the body it belongs to and its pose in the frame of that body's link."""
     # Without mass a link on a fixed joint at a solid is only a place on it.
     places = {robot.root: (GROUND, np.eye(4))}
@@ -494,9 +490,9 @@ class RobotLoops:
     """
 
     passive: frozenset[str] = frozenset()
-    closures: tuple[Mapping[str, Any], ...] = ()
+    closures: Sequence[Mapping[str, Any]] = ()
     interfaces: Mapping[str, Sequence[tuple[str, np.ndarray]]] | None = None
-    rods: tuple[str, ...] = ()
+    rods: Sequence[str] = ()
 
 
 NO_LOOPS = RobotLoops()
@@ -537,7 +533,7 @@ def read_loops(
             interfaces.setdefault(site[0], []).append((keys["name"], site[1]))
         if keys["kind"] == "rod" and "length" not in keys:
             rods.append(keys["name"])
-    return RobotLoops(frozenset(passive), tuple(closures), interfaces, tuple(rods))
+    return RobotLoops(frozenset(passive), closures, interfaces, rods)
 
 
 @dataclass(frozen=True, eq=False)

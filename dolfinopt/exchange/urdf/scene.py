@@ -80,16 +80,16 @@ class RobotScene:
     Attributes:
         robot: where it is from.
         bodies: its arms.
-        duration: of the trajectory, s.
+        t: (n,) instants of the trajectory, s.
+        rows: (n, joints) of all joints that move, rad or m, then of driven rods, m.
         loops: closed ones.
-        start_joints: where all joints that move begin, rad or m.
     """
 
     robot: Robot
-    bodies: tuple[SceneBody, ...]
-    duration: float
-    loops: RobotLoops = NO_LOOPS
-    start_joints: tuple[float, ...] = ()
+    bodies: Sequence[SceneBody]
+    t: np.ndarray
+    rows: np.ndarray
+    loops: RobotLoops
 
     @property
     def arms(self) -> dict[str, str]:
@@ -105,7 +105,7 @@ class RobotScene:
         """Return the scene as TOML with comments."""
         solids = [body for body in self.bodies if body.is_solid]
         extents = {body.link: _extent(body) for body in solids}
-        start = dict(zip((joint.name for joint in self.robot.movable), self.start_joints))
+        start = dict(zip((joint.name for joint in self.robot.movable), self.rows[0].tolist()))
         return filled(
             "robot.toml.jinja",
             {
@@ -126,7 +126,7 @@ class RobotScene:
             density=DENSITY,
             centred=CENTRED,
             trajectory=TRAJECTORY,
-            horizon=self.duration * (1.0 + SETTLING),
+            horizon=self.t[-1] * (1.0 + SETTLING),
             radius=RADIUS * max(extent.cell for extent in extents.values()),
             weighed=all(body.inertia.mass > 0.0 for body in solids),
             initial_joints=[start.get(body.joint.name) for body in self.bodies if body.joint.moves],
@@ -159,12 +159,10 @@ class RobotScene:
         """Return the name of a solid's mesh file."""
         return f"{self.arms[body.link]}.msh"
 
-    def files(self, folder: Path, t: np.ndarray, rows: np.ndarray) -> dict[str, str | bytes]:
-        """Return all files of a folder by their names, the scene last: where it is, all are.
+    def files(self, folder: Path) -> dict[str, str | bytes]:
+        """Return all files of the scene's folder by their names, the scene last.
 
-        Args:
-            folder: of the scene.
-            t, rows: (n,) s, (n, joints) of all joints that move, then of driven rods.
+        Where it is, all are.
         """
         from dolfinopt.mesh.solid_cells import msh_bytes  # loads Gmsh
 
@@ -174,11 +172,11 @@ class RobotScene:
         names = [*(joint.name for joint in self.robot.movable), *self.loops.rods]
         columns = {
             self.joints.get(name, name): values.tolist()
-            for name, values in zip(names, rows.T, strict=True)
+            for name, values in zip(names, self.rows.T, strict=True)
             if name not in self.loops.passive
         }
         lines = [",".join(["t", *columns])]
-        lines += [",".join(map(repr, row)) for row in zip(t.tolist(), *columns.values())]
+        lines += [",".join(map(repr, row)) for row in zip(self.t.tolist(), *columns.values())]
         new[TRAJECTORY] = "\n".join(lines) + "\n"
         # What `export RUN robot` needs: the file, and every solid's link and frame.
         urdf = Path(os.path.relpath(self.robot.file.absolute(), folder.absolute())).as_posix()
@@ -318,14 +316,14 @@ def read_trajectory(
     return table.t, every, [*held, *_too_fast(robot, file, rates)]
 
 
-def _columns_of(robot: Robot, file: str, rods: Sequence[str]) -> tuple[str, ...]:
+def _columns_of(robot: Robot, file: str, rods: Sequence[str]) -> list[str]:
     """Return a table's columns but t: joints with a coordinate of their own, all driven rods."""
     names, joints = column_names(file), [joint.name for joint in robot.joints]
     own = [joint.name for joint in robot.movable if joint.mimic is None]
     allowed = f"expected t and any of {', '.join(own)}"
     if "t" not in names:
         raise InputError(f"{file}: no column t, the instants in s; {allowed}")
-    result = tuple(name for name in names if name != "t")
+    result = [name for name in names if name != "t"]
     if wrong := [name for name in result if name not in (*own, *rods)]:
         what = "this joint is fixed, or follows another" if wrong[0] in joints else "no such joint"
         raise InputError(f"{file}: column {wrong[0]!r}: {what}; {allowed}")
@@ -394,14 +392,14 @@ Warn = Callable[[list[str]], None]
 
 def scene_of_robot(
     robot: Robot,
-    links: tuple[str, ...],
+    links: Sequence[str],
     tool: str | None,
     trajectory: str,
     closures: Path | None,
     boxes: bool,
     warn: Warn,
-) -> tuple[RobotScene, np.ndarray, np.ndarray]:
-    """Return the scene of a robot, instants (n,) and rows (n, joints and rods) of its table.
+) -> RobotScene:
+    """Return the scene of a robot that moves as a table says.
 
     Args:
         robot: as its file has it.
@@ -422,9 +420,8 @@ def scene_of_robot(
     t, rows, said = read_trajectory(robot, trajectory, loops)
     warn([*said, *implausible_inertias(robot)])
     if not boxes:
-        bodies = tuple(meshed(robot, body, warn) if body.is_solid else body for body in bodies)
-    start_joints = tuple(map(float, rows[0, : len(robot.movable)]))
-    return RobotScene(robot, bodies, float(t[-1]), loops, start_joints), t, rows
+        bodies = [meshed(robot, body, warn) if body.is_solid else body for body in bodies]
+    return RobotScene(robot, bodies, t, rows, loops)
 
 
 def meshed(robot: Robot, body: SceneBody, warn: Warn) -> SceneBody:
