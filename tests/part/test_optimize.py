@@ -345,7 +345,6 @@ def test_truss_has_interfaces_and_area_of_the_part(truss, tmp_path):
         sorted((p.label, *p.curve.start, *p.curve.end) for p in one.shape.pieces if p.label)
         for one in (part, made)
     )
-    assert len(ends) == 2
     np.testing.assert_allclose([e[1:] for e in others], [e[1:] for e in ends], atol=1e-9)
     assert len(made.shape.loops) > 5 and made.shape.is_simple(1e-5)
     search = Saved(1, 2, "", {"stress": 1.1}, {0: made.sides}, {})

@@ -118,22 +118,21 @@ def test_narrowest_member_and_gap_are_differentiated():
 
 def test_sides_of_a_strut_become_parallel():
     """Not its ends, which are further apart than they are long; steeper sides are a wedge."""
-    for slope, pairs in ((0.06, 1), (0.2, 0)):
+    for slope, rows in ((0.06, 2), (0.2, 0)):
         places = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, 0.03], [0.0, 0.03 - 0.1 * slope]])
         ways = np.roll(places, -1, axis=0) - places
         blade = (Side(p + 0.5 * d, angle_of(d)) for p, d in zip(places, ways, strict=True))
         sides = Sides((Loop(tuple(blade), corners(*places)),)).centred()
         limits = replace(LIMITS, member=1e-3, arm=shapely.box(-1, -1, 1, 1), stays=shapely.Point())
-        assert len(struts(sides)[0]) == 2 * pairs
+        assert len(struts(sides)[0]) == rows
         found, _ = limits.nearest(sides)
-        assert np.abs(struts(found)[2]).max(initial=0.0) < 1e-3
-        if pairs:
+        assert (np.abs(struts(found)[2]) < 1e-3).all()
+        for k, (_, slope) in enumerate(limits._struts(sides)):
 
-            def rows(some, limits=limits):
-                return np.array([value for value, _ in limits._struts(some)])
+            def row(some, limits=limits, k=k):
+                return np.array([[*limits._struts(some)][k][0]])
 
-            _, slopes = zip(*limits._struts(sides), strict=True)
-            np.testing.assert_allclose(slopes, differences(sides, rows), atol=1e-8)
+            np.testing.assert_allclose([slope], differences(sides, row), atol=1e-8)
 
 
 def test_nearest_outline_keeps_the_limits_and_an_area():
@@ -204,7 +203,6 @@ def test_ties_hold_mirror_images():
 
 def test_sides_of_a_frame_are_straight_flanges_and_struts(design):
     part = make_part(design(frame), Curves(0.003))
-    assert {type(curve) for curve in part.shape.curves} == {Line, Arc}
     assert part.shape.area == pytest.approx(part.domain.volume, rel=1e-5)
     assert part.distance <= 0.5 * part.domain.cell
     assert not part.tight and len(part.shape.loops) == 5
