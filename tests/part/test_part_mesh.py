@@ -1,5 +1,7 @@
 """Meshes along the curves of parts, and the stress on their outline."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -102,15 +104,15 @@ def test_corners_and_ends_of_interfaces_are_singular():
 
 def shoulder(fillet):
     """A bar of 60 mm that narrows to 40 mm."""
-    x, y = 0.5 * LENGTH, HEIGHT / 3.0
+    x, y, top = 0.5 * LENGTH, HEIGHT / 3.0, 0.5 * HEIGHT
     right, off = x + fillet, y + fillet
-    ends = [[x, 1.5 * y], [0.0, 1.5 * y], [0.0, -1.5 * y], [x, -1.5 * y], [x, -off],
+    ends = [[x, top], [0.0, top], [0.0, -top], [x, -top], [x, -off],
             [right, -y], [LENGTH, -y], [LENGTH, y], [right, y], [x, off]]  # fmt: skip
-    curves = [Line(a, b) for a, b in zip(np.array(ends), np.roll(ends, -1, axis=0), strict=True)]
+    curves = [Line(a, b) for a, b in pairwise(np.array([*ends, ends[0]]))]
     for k, centre, begin in ((4, [right, -off], np.pi), (8, [right, off], -0.5 * np.pi)):
         curves[k] = Arc(np.array(centre), fillet, begin, -0.5 * np.pi)
     labels = {1: "inboard", 6: "outboard"}
-    return Shape((tuple(Piece(curve, labels.get(k, "")) for k, curve in enumerate(curves)),))
+    return Shape((tuple(Piece(c, labels.get(k, "")) for k, c in enumerate(curves)),))
 
 
 def concentration(mesh, width, file):
