@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -52,7 +52,7 @@ def optimize(
     out: Path | None,
     resume: bool,
     overwrite: bool,
-    overrides: tuple[str, ...],
+    overrides: Sequence[str],
     plots: bool,
     verbose: bool,
 ) -> None:
@@ -176,7 +176,7 @@ def simulate(
     design: Path | None,
     out: Path | None,
     overwrite: bool,
-    overrides: tuple[str, ...],
+    overrides: Sequence[str],
     plots: bool,
     verbose: bool,
 ) -> None:
@@ -204,7 +204,7 @@ def gradient(
     out: Path | None,
     check: bool,
     overwrite: bool,
-    overrides: tuple[str, ...],
+    overrides: Sequence[str],
 ) -> None:
     """Write the gradient with respect to the physical densities to FILE."""
     out = out or Path("results") / f"{scene.stem}-gradient" / "gradient.npz"
