@@ -133,11 +133,7 @@ def _frequency(number: int) -> Callable[[SimulationResult], float]:
 
 
 NUMBERS: dict[str, Callable[[SimulationResult], float]] = {
-    "mass": lambda result: sum(
-        body.mass
-        for arm, body in zip(result.scene.arms, _trajectory(result).mechanism.bodies)
-        if not arm.rigid and arm.sid is None
-    ),
+    "mass": lambda result: sum(result.mass[arm.name] for arm in result.scene.arms if arm.flexible),
     "stress": lambda result: result.stress_at_points,
     "settling": _response("settling"),
     "orientation": _response("orientation"),

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import click
 from mpi4py import MPI
 
-from dolfinopt.cli.begin import elapsed
-from dolfinopt.cli.report import conclude
+from dolfinopt.cli.begin import elapsed, warn
 from dolfinopt.cli.shared import (
+    chosen,
     claim,
     draw,
     in_words,
@@ -22,21 +24,25 @@ from dolfinopt.cli.shared import (
     tell,
     tell_assumed,
 )
+from dolfinopt.data import filled
 from dolfinopt.errors import ConvergenceError, InputError
 from dolfinopt.optimization.evaluator import Evaluator
 from dolfinopt.optimization.gradient_check import STEPS, check_exact, taylor_test
 from dolfinopt.optimization.measured import PASSING_RATE
-from dolfinopt.optimization.result import RankResult
+from dolfinopt.optimization.result import RankResult, Result
+from dolfinopt.optimization.stopping import StopCode
 from dolfinopt.output import checkpoint, run_folder
 from dolfinopt.output.design import Designed, arms_with_design, read_history, write_gradient
 from dolfinopt.output.folders import check_unused, prepare_folder, remove_stale, working_alone
+from dolfinopt.output.summary import is_grey
 from dolfinopt.output.trajectory import read_initial_deviation
 from dolfinopt.parallel import on_root, together
 from dolfinopt.profiling import Profile
 from dolfinopt.progress import with_unit
 from dolfinopt.responses import evaluation
+from dolfinopt.responses.constraints import limits_of
 from dolfinopt.responses.order_selection import choose_coordinates
-from dolfinopt.responses.response import needs
+from dolfinopt.responses.response import needs, objective_of
 from dolfinopt.scene.load import Scene
 
 
@@ -46,7 +52,7 @@ def optimize(
     out: Path | None,
     resume: bool,
     overwrite: bool,
-    overrides: tuple[str, ...],
+    overrides: Sequence[str],
     plots: bool,
     verbose: bool,
 ) -> None:
@@ -99,7 +105,66 @@ def _conclude(folder: Path, result: RankResult, plots: bool, verbose: bool) -> N
     pictures = partial(draw, result) if plots else None
     summary = run_folder.write_result(folder, result, elapsed(), pictures=pictures)
     if summary is not None:
-        conclude(result, summary, folder, verbose)
+        _tell(result, summary, folder, verbose)
+
+
+# -- what a run tells at its end: why it ended, what it gained, which limits hold ----------------
+
+
+def _tell(result: Result, summary: Mapping[str, Any], folder: Path, verbose: bool) -> None:
+    """Print the run's warnings, what the deviation comes from, and what came of it (root only)."""
+    warn(summary["warnings"])
+    optimizer = result.scene.optimizer
+    report = filled(
+        "report.txt.jinja",
+        {"with_unit": with_unit},
+        result=result,
+        summary=summary,
+        folder=folder,
+        verbose=verbose,
+        chosen=chosen,
+        # Uniform arms with solid ends exceed their volume: an optimisation begins by taking that
+        # away.
+        limits=[o for o in result.limits if result.optimised or o.quantity != "volume_fraction"],
+        turned=objective_of(result.scene).turned,
+        gained=list(_gained(result)) if result.optimised else [],
+        grey=is_grey(result.scene, summary["grayness"]),
+        spent=result.stop_code is StopCode.ITERATIONS,
+        more=2 * optimizer.max_iterations or type(optimizer)().max_iterations,
+    )
+    click.echo(report, nl=False)
+
+
+def _gained(result: Result) -> Iterator[str]:
+    """Yield how the objective stands to that of the start, and of bars."""
+    value = result.evaluation.objective
+    yield _against(value, result.rows[0].objective, "the starting design")
+    if result.bars is not None:
+        yield _against_bars(result, value)
+
+
+def _against(value: float, other: float, what: str) -> str:
+    """Return e.g. "64 % below the starting design"."""
+    percent = 100.0 * (value / other - 1.0) if other else 0.0
+    if abs(percent) < 0.05:
+        return f"as {what}"
+    return f"{abs(percent):.2g} % {'below' if percent < 0.0 else 'above'} {what}"
+
+
+def _against_bars(result: Result, value: float) -> str:
+    """Compare a design with straight solid bars of the same mass."""
+    assert result.bars is not None
+    bars = "straight solid bars of the same mass"
+    exceeded = [
+        limit
+        for limit in limits_of(result.scene, result.bars)
+        if limit.excess > 0.01 and not limit.of_mass
+    ]
+    missed = ", ".join(item.usage for item in exceeded)
+    if result.scene.objective.kind == "mass":
+        return f"{bars} have {missed}" if missed else f"as {bars}, which keep the limits, too"
+    text = _against(value, result.bars.objective, bars)
+    return f"{text} (which have {missed})" if missed else text
 
 
 # -- `dolfinopt simulate` ------------------------------------------------------------------------
@@ -111,7 +176,7 @@ def simulate(
     design: Path | None,
     out: Path | None,
     overwrite: bool,
-    overrides: tuple[str, ...],
+    overrides: Sequence[str],
     plots: bool,
     verbose: bool,
 ) -> None:
@@ -139,7 +204,7 @@ def gradient(
     out: Path | None,
     check: bool,
     overwrite: bool,
-    overrides: tuple[str, ...],
+    overrides: Sequence[str],
 ) -> None:
     """Write the gradient with respect to the physical densities to FILE."""
     out = out or Path("results") / f"{scene.stem}-gradient" / "gradient.npz"

@@ -116,7 +116,7 @@ def summarise(
             "versions": versions(),
             "scene": scene.to_dict(),
         }
-        return dict(finite(result))
+        return finite(result)
 
 
 def figures(run: RankResult, wall: float) -> dict[str, Any]:

@@ -40,6 +40,7 @@ STRESS_COLOURS = "YlOrRd"  # nothing is light, the largest dark
 WALL_COLOURS = "viridis_r"
 STRESS, WALL = "largest von Mises stress along the motion [MPa]", "thickness of the wall [mm]"
 MEGA = 1e-6
+QUARTERS = 0.0, 0.25, 0.5, 0.75, 1.0
 LOW = 0.45  # inches, least height of an arm's axes
 SCALE_FOOT = 0.75  # inches, for the scale of colours
 LABEL_FOOT = 0.6  # inches, for the label of x
@@ -91,7 +92,7 @@ def _densities_figure(views: Sequence[ArmView], title: str) -> Figure:
     keys = {key: item for axes in rows for item, key in zip(*axes.get_legend_handles_labels())}
     if keys:
         figure.legend(list(keys.values()), list(keys), loc="lower left")
-    colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))
+    colour_scale(figure, DENSITY, COLOURS, QUARTERS)
     return figure
 
 
@@ -172,7 +173,7 @@ def parts_figure(
             f"{len(shape.loops) - 1} holes, {len(shape.curves)} curves"
         )
     if not own:
-        colour_scale(figure, DENSITY, COLOURS, (0.0, 0.25, 0.5, 0.75, 1.0))
+        colour_scale(figure, DENSITY, COLOURS, QUARTERS)
     return figure
 
 

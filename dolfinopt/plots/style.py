@@ -239,7 +239,7 @@ def colour_scale(
     width, height = figure.get_size_inches()
     axes = figure.add_axes((0.5 - 2.5 / width, 0.55 / height, 5.0 / width, 0.15 / height))
     shown = ScalarMappable(Normalize(0.0, marks[-1]), colours)
-    figure.colorbar(shown, cax=axes, orientation="horizontal", ticks=list(marks), label=label)
+    figure.colorbar(shown, cax=axes, orientation="horizontal", ticks=marks, label=label)
 
 
 def save(figure: Figure, path: Path) -> Path:

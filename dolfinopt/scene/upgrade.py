@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from typing import Any
 
@@ -24,7 +24,7 @@ Lines = list[tuple[str, str]]
 Block = tuple[str, Lines]  # a table's dotted path, "" of the keys before all tables
 
 
-def upgraded(source: str) -> tuple[str, list[str]]:
+def upgraded(source: str) -> tuple[str, Sequence[str]]:
     """Return the text of a scene's file in the words of now, and what each older word became.
 
     Raises:
@@ -43,7 +43,7 @@ def upgraded(source: str) -> tuple[str, list[str]]:
     if not same:
         by_hand = "; ".join(before.old_words)
         raise InputError(f"{source}: cannot be rewritten; change by hand: {by_hand}")
-    return text, list(before.old_words)
+    return text, before.old_words
 
 
 def _in_new_words(

@@ -125,7 +125,7 @@ def before_after_page(
         ],
         machines=_drawn(sides, "machine.png"),
         links=_drawn(sides, "design.png"),
-        curves=list(_curves(sides)),
+        curves=_curves(sides),
         table=table,
         sections=sections,
         differing=differences(before.scene, after.scene),

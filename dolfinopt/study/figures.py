@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from dolfinopt.output.design import designed, read_views
-from dolfinopt.plots import style
+from dolfinopt.plots import design, style
 from dolfinopt.plots.panels import Looks, panel_figure
 from dolfinopt.plots.style import GREY
 from dolfinopt.study import tables
 from dolfinopt.study.tables import FrameFigure, LineFigure
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 CROWD = 7  # matrix columns that still have room for large numbers
 LOSS = 10.0  # %, the end of the colour scale of all losses: equal colours are equal losses
@@ -97,18 +95,16 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
 
     Columns: design, sample (number 0 is the nominal one), and the quantities.
     """
-    from matplotlib.ticker import MaxNLocator
-
     designs = list(figure.frame.groupby("design", sort=False))
     quantities = list(figure.frame.columns[2:])
     title = f"{figure.title}; dashed: nominal"
     drawn, grid = _grid(title, len(designs), len(quantities), 5.2, 3.2)
-    for row, (design, own) in zip(grid, designs, strict=True):
+    for row, (name, own) in zip(grid, designs, strict=True):
         for axes, what in zip(row, quantities, strict=True):
             values = own.loc[own["sample"] > 0, what].to_numpy()
-            axes.hist(values, bins="fd", color=styles[design]["color"], alpha=0.55)
+            axes.hist(values, bins="fd", color=styles[name]["color"], alpha=0.55)
             axes.axvline(own[what].iloc[0], color="black", linestyle="--", linewidth=1.2)
-            axes.set(title=design, xlabel=what, ylabel="samples [-]")
+            axes.set(title=name, xlabel=what, ylabel="samples [-]")
             axes.yaxis.set_major_locator(MaxNLocator(integer=True))
             share = axes.twinx()
             share.ecdf(values, color=GREY)
@@ -121,8 +117,6 @@ def histogram_figure(figure: FrameFigure, styles: Looks) -> Figure:
 
 def design_figure(figure: tables.DesignFigure) -> Figure:
     """Return the designs below each other, to one scale."""
-    from dolfinopt.plots import design
-
     every = [
         replace(view, name=f"{label}: {view.name}")
         for label, scene, path in figure.designs

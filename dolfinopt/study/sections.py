@@ -148,7 +148,7 @@ class Members:
         if self.section.plane is None:
             height, thickness = self.section.measures(arm.height, arm.thickness, share)
             cells = arm.cells or _bar_cells(arm.length, height, thickness, arm.is_solid)
-            return row | {"height": height, "thickness": thickness, "cells": list(cells)}
+            return row | {"height": height, "thickness": thickness, "cells": cells}
         mesh = member(self.section, arm.length, (arm.height, arm.thickness), share)
         data = msh_bytes(mesh)
         path = self.folder / NAME / f"{hashlib.sha256(data).hexdigest()[:16]}.msh"

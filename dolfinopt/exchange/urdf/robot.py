@@ -568,7 +568,7 @@ class _Reader:
         keys["point"] = second[:3, 3].tolist()
         if stated.kind != "rod":
             turn = Rotation.from_euler("xyz", stated.rpy).as_matrix()
-            keys["rpy"] = list(roll_pitch_yaw_of(second[:3, :3] @ turn))
+            keys["rpy"] = roll_pitch_yaw_of(second[:3, :3] @ turn)
         keys["between"], interface = [(body, ""), (other, "")], None
         if not self.bodies[body].is_solid and np.linalg.norm(first[:3, 3]) > SAME_PLACE:
             keys["between"][0], interface = (body, f".{stated.name}"), (body, first[:3, 3])
