@@ -392,10 +392,9 @@ class Filled:
         """Return what is said of pieces of a size, m2 or m3, that were left out."""
         if not count:
             return []
-        pieces = "1 piece" if count == 1 else f"{count} pieces"
         return [
-            f"arm {self.name!r}: {pieces} without a joint to both interfaces "
-            f"({MM**dim * size:.3g} mm{dim}, {100.0 * size / self.volume:.2g} % of the volume) "
+            f"arm {self.name!r}: {count} piece{'s' * (count > 1)} without a joint to both "
+            f"interfaces ({MM**dim * size:.3g} mm{dim}, {100.0 * size / self.volume:.2g} % of the volume) "
             "left out"
         ]
 

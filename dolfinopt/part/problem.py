@@ -121,8 +121,9 @@ class Problem:
         return {k: result[k] for k in sorted(result)}
 
     def parts_of(self, outlines: Mapping[int, FreeSides]) -> dict[int, Part]:
-        """Return the parts of all arms with these outlines."""
-        return {k: item.current for k, item in self.every(outlines).items()}
+        """Return the parts of all arms with these outlines, as they are drawn."""
+        every = self.every({k: item.drawn() for k, item in outlines.items()})
+        return {k: item.current for k, item in every.items()}
 
     def _factors(self, k: int) -> np.ndarray:
         """Return the sizes of an arm over those of the one whose design it repeats."""
@@ -249,11 +250,11 @@ class Problem:
         """Return volumes over their limits, less 1, (k,) and their derivatives (k, n)."""
         share, rows, slopes = self.scene.design.volume_fraction, [], []
         for outline in outlines.values():
-            domain, t = outline.part.domain, outline.part.domain.thickness
+            domain, sides, t = outline.part.domain, outline.sides, outline.part.domain.thickness
             # What the densities have: sides may have begun a little above the limit.
             most = max((share or 0.0) * domain.full_volume, domain.volume)
-            rows.append([t * outline.sides.shape.area, t * most])
-            slopes.append(t * outline.area_by_x())
+            rows.append([t * sides.shape.area, t * most])
+            slopes.append(t * sides.area_by_q() @ sides.ties)
         every = np.hstack([rows, block_diag(*slopes)])
         if self.scene.design.shared_volume:
             every = every.sum(axis=0, keepdims=True)

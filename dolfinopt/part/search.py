@@ -250,7 +250,7 @@ class Search:
         """Return the limits that a step of this radius can meet."""
         reach, far, A, b = self.radius * FAR, [], [], []
         for outline in state.outlines.values():
-            g, own = outline.rows()
+            g, own = outline.limits.rows(outline.sides)
             near = g > -reach * outline.cell * np.abs(own).sum(axis=1) - 0.1 * outline.cell
             A.append(own[near] / outline.cell)
             b.append(np.maximum(-g[near] / outline.cell, 0.0))

@@ -13,7 +13,7 @@ from dolfinopt.mesh.solid_cells import Tetrahedra
 from dolfinopt.part.domain import SolidDomain
 from dolfinopt.part.mesh import BodyMesh, PlateMesh, extruded
 from dolfinopt.part.plane.curves import Line, angle_of, left, unit
-from dolfinopt.part.plane.limits import Limits
+from dolfinopt.part.plane.limits import Limits, rounded_radii
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import (
     Loop,
@@ -67,13 +67,10 @@ class FreeSides:
         """The part with these sides."""
         return self.plane if self.solid is None else plate_part(self.solid, self.plane)
 
-    @property
-    def _ties(self) -> np.ndarray:
-        return self.sides.ties if self.repeated is None else self.repeated
-
-    def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return what must not be positive (m,), m, and its derivatives (m, count)."""
-        return self.limits.rows(self.sides)
+    def drawn(self) -> FreeSides:
+        """Return it with radii of whole half millimetres, if they are asked for."""
+        rounds = self.part.rounds
+        return replace(self, sides=rounded_radii(self.sides, self.limits)) if rounds else self
 
     def simpler(self) -> list[FreeSides]:
         """Return it without what its limits hold at its least, every one without a thing more."""
@@ -130,11 +127,7 @@ class FreeSides:
         for number, item in enumerate(self.sides.placed):
             here = np.flatnonzero(mesh.piece == number)
             result += item.pull(mesh.span[here, 0], g[:, here], len(here))
-        return result @ self._ties
-
-    def area_by_x(self) -> np.ndarray:
-        """Return the derivative (count,) of the area by x."""
-        return self.sides.area_by_q() @ self._ties
+        return result @ (self.sides.ties if self.repeated is None else self.repeated)
 
     def scaled(self, part: PlanePart, factors: np.ndarray) -> FreeSides:
         """Return the sides of a part that repeats this one's design, stretched by (2,) factors.

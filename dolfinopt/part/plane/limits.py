@@ -385,7 +385,8 @@ def facing(sides: Sides, cell: float, most: float) -> Facing:
 def thinnest_member(sides: Sides, cell: float) -> float | None:
     """Return the width of the thinnest member, m; None where none is below `WIDE` cells."""
     result = facing(sides, cell, WIDE * cell)
-    return float(result.width[result.members].min(initial=np.inf)) if result.members.any() else None
+    widths = result.width[result.members]
+    return float(widths.min()) if len(widths) else None
 
 
 def _chords(placed: Placed, chord: float) -> list[Placed]:

@@ -55,12 +55,14 @@ class PlanePart:
         outline: its polygon.
         sides: its own outline.
         tolerance: of the outline's polygon and of chords, m.
+        rounds: whether radii shall be whole half millimetres.
     """
 
     domain: Domain
     outline: Outline
     sides: Sides
     tolerance: float
+    rounds: bool = False
 
     COARSER: ClassVar[float] = 2.0  # sides of the mesh with which the one of the scene is compared
     REFINEMENTS: ClassVar[int] = 2  # of the mesh where stress is largest, at most
@@ -241,4 +243,4 @@ def make_part(domain: Domain, curves: Curves = DEFAULTS) -> PlanePart:
     sides = fitted_sides(outline, limits, away, domain.volume)
     if curves.rounds:
         sides = rounded_radii(sides, limits)
-    return PlanePart(domain, outline, sides, fine)
+    return PlanePart(domain, outline, sides, fine, curves.rounds)
