@@ -22,7 +22,6 @@ from mpi4py import MPI
 from dolfinopt.errors import InputError
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.plots.panels import Line, Panel
-from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.cases import Case, Outcome, Steps
 from dolfinopt.study.tables import (
@@ -175,7 +174,7 @@ def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
         for path in designs:
             if not path.is_file():
                 raise InputError(f"{path}: --design: no such file; give design.npz files")
-            arms_with_design(MPI.COMM_SELF, scene, path, Profile())
+            arms_with_design(MPI.COMM_SELF, scene, path)
         names = [path.parent.name if path.stem == "design" else path.stem for path in designs]
         plain = len(set(names)) == len(names)
         return {n if plain else str(p): p for n, p in zip(names, designs, strict=True)}
