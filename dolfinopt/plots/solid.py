@@ -109,10 +109,10 @@ class Studio:
             mesh = pyvista.lines_from_points(points)
             self.plotter.add_mesh(mesh, color=colour, line_width=LINE, lighting=False, **PLAIN)
 
-    def bar(self, ends: np.ndarray, radius: float, colour: Colour = BAR) -> None:
-        """Draw a round bar between two points (2, 3), m; nothing where they coincide."""
-        if not np.allclose(*ends):
-            self.add(pyvista.Line(*ends).tube(radius=radius, n_sides=SIDES), color=colour)
+    def bar(self, start: np.ndarray, end: np.ndarray, radius: float, colour: Colour) -> None:
+        """Draw a round bar between two points (3,), m; nothing where they coincide."""
+        if not np.allclose(start, end):
+            self.add(pyvista.Line(start, end).tube(radius=radius, n_sides=SIDES), color=colour)
 
     def ball(self, centre: np.ndarray, radius: float, colour: Colour) -> None:
         """Draw a sphere."""
