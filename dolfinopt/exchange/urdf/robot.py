@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -41,8 +41,7 @@ Point = tuple[float, float, float]
 MOVABLE = ("revolute", "continuous", "prismatic")
 
 
-@dataclass(frozen=True, eq=False)
-class Mimic:
+class Mimic(NamedTuple):
     """A joint that follows another: q = multiplier * q_joint + offset."""
 
     joint: str
