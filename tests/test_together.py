@@ -238,8 +238,8 @@ PLACES = [
     (choosing, 0, coordinates, "_distance"),
     (optimising, LONE, arm.Arm, "physical_designs"),
     (optimising, LONE, arm.Arm, "backward", 1),  # the first call passes
-    (optimising, 0, run_folder, "write_history"),
-    (optimising, 0, run_folder, "append_history", 1),
+    (optimising, 0, checkpoint, "write_history"),
+    (optimising, 0, checkpoint, "append_history", 1),
     (optimising, 0, checkpoint, "write_arrays", 0),
     (optimising, 0, checkpoint, "write_arrays", 1),
     (optimising, LONE, checkpoint, "_of_arm"),

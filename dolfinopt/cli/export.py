@@ -82,7 +82,7 @@ def export(
     names = [f"{arm.name}{ending}" for arm in loaded.arms for ending in KINDS]
     check_instant(loaded, at)
     claim(world, folder, overwrite, names if kind == "bodies" else STATE_SPACE, scene=loaded)
-    place = arms_with_design(world, loaded, design, Profile())
+    place = arms_with_design(world, loaded, design)
     tell(choose_coordinates(*place, Profile()))
     if kind == "bodies":
         _export_bodies(world, place, folder)
@@ -245,11 +245,11 @@ def _links(world: MPI.Comm, scene: Scene, run: Path) -> _Links:
 
     folder, owners = run / PARTS, dict(zip(scene.places, scene.owners, strict=True))
     if not on_root(world, lambda: (folder / SCENE).is_file() and not stale_parts(folder)):
-        bodies = arms_with_design(world, scene, run / "design.npz", Profile()).bodies()
+        bodies = arms_with_design(world, scene, run / "design.npz").bodies()
         parts = make_parts(scene, run, world=world)
         return {name: (bodies[k], parts[k].facets) for name, k in owners.items() if k in parts}
     machine: Scene = on_root(world, load_scene, folder / SCENE)
-    bodies = arms_with_design(world, machine, None, Profile()).bodies()
+    bodies = arms_with_design(world, machine, None).bodies()
     links = {}
     for k, arm in enumerate(machine.arms):
         owner = owners.get(arm.name)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import os
 import re
 import sys
@@ -24,8 +23,8 @@ from dolfinopt.errors import InputError
 from dolfinopt.interrupt import launched_rank
 from dolfinopt.output.folders import check_new, write_files
 from dolfinopt.scene.messages import KeyInfo, describe_keys
-from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, scene_schema
-from dolfinopt.scene.tables.base import Refusal
+from dolfinopt.scene.schema import SCHEMA_FILE, check_scene_name, schema_text
+from dolfinopt.scene.tables.base import Refusal, toml_value
 from dolfinopt.scene.tables.material import CATALOGUE, SOURCES
 from dolfinopt.version import __version__
 
@@ -47,11 +46,11 @@ def init(name: Path, template: str, older: str | None) -> None:
     for source in sorted(template_folder().glob(f"{template}.*"), reverse=True):
         text = source.read_text(encoding="utf-8")
         for mark, value in (("@NAME@", title), ("@STEM@", path.stem)):
-            text = text.replace(f'"{mark}', '"' + json.dumps(value, ensure_ascii=False)[1:-1])
+            text = text.replace(f'"{mark}', toml_value(value)[:-1])
         texts[path.with_suffix(source.suffix).name] = text
     schema = path.with_name(SCHEMA_FILE)
     check_new(path.with_name(name) for name in texts)
-    write_files(path.parent, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n", **texts})
+    write_files(path.parent, {SCHEMA_FILE: schema_text(), **texts})
     written = ", ".join(os.fspath(path.with_name(name)) for name in texts)
     told = [
         f"{written}: edit the values that differ for your machine",
@@ -75,7 +74,7 @@ def keys(pattern: str | None, schema: bool, upgrade: Path | None) -> None:
     if schema:
         if pattern is not None:
             raise InputError(f"{pattern}: expected no PATTERN with --schema")
-        click.echo(json.dumps(scene_schema(), indent=2))
+        click.echo(schema_text(), nl=False)
         return
     known = describe_keys()
     result = [info for info in known if _fits(info, pattern or "*")]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import os
 from pathlib import Path
 
@@ -19,7 +18,7 @@ from dolfinopt.interrupt import ending_at_once
 from dolfinopt.loading import load_scene
 from dolfinopt.output.folders import check_new, write_files
 from dolfinopt.parallel import together
-from dolfinopt.scene.schema import SCHEMA_FILE, scene_schema
+from dolfinopt.scene.schema import SCHEMA_FILE, schema_text
 
 
 def import_robot(
@@ -60,7 +59,7 @@ def _write_scene(
         _keep_edited(path, new[name])
     else:
         check_new((folder / item for item in new), kept)
-    write_files(folder, {SCHEMA_FILE: json.dumps(scene_schema(), indent=2) + "\n", **new})
+    write_files(folder, {SCHEMA_FILE: schema_text(), **new})
     click.echo(filled("imported.txt.jinja", {}, path=path, scene=scene), nl=False)
     try:
         load_scene(path)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from mpi4py import MPI
 
 from dolfinopt.disk import (
     append_text,
@@ -21,18 +22,23 @@ from dolfinopt.errors import InputError
 from dolfinopt.mesh import compat
 from dolfinopt.mesh.solid_cells import TENSOR
 from dolfinopt.optimization.state import HistoryRow
-from dolfinopt.parallel import Partition, gather_arms, gather_tables, on_root, together
+from dolfinopt.parallel import (
+    Partition,
+    gather_arms,
+    gather_tables,
+    on_root,
+    partition_arms,
+    together,
+)
+from dolfinopt.profiling import Profile
 from dolfinopt.scene.law_variables import LAW, law_names, law_values, with_law
 from dolfinopt.scene.load import Arm as ArmKeys
 from dolfinopt.scene.load import Scene
 
 if TYPE_CHECKING:
-    from mpi4py import MPI
-
     from dolfinopt.arms.arm import Arm
     from dolfinopt.mesh.arm_mesh import ArmMesh
     from dolfinopt.multibody.shape_integrals import ShapeIntegrals
-    from dolfinopt.profiling import Profile
     from dolfinopt.responses.stress_report import ArmStress
 
 
@@ -262,11 +268,7 @@ def read_views(scene: Scene, path: Path) -> list[ArmView]:
     Raises:
         InputError: the file cannot be read, or does not fit the scene's arms.
     """
-    from mpi4py import MPI
-
-    from dolfinopt.profiling import Profile
-
-    return gather_views(*arms_with_design(MPI.COMM_SELF, scene, path, Profile()))
+    return gather_views(*arms_with_design(MPI.COMM_SELF, scene, path))
 
 
 class Designed(NamedTuple):
@@ -295,21 +297,20 @@ class Designed(NamedTuple):
 
 
 def arms_with_design(
-    world: MPI.Comm, scene: Scene, design: Path | None, profile: Profile
+    world: MPI.Comm, scene: Scene, design: Path | None, profile: Profile | None = None
 ) -> Designed:
     """Build the arms; return them with the physical densities of a file, or the initial ones.
 
-    The scene is under the law of the file's design.
+    The scene is under the law of the file's design. Without a profile nobody counts what is done.
 
     Raises:
         InputError: the design does not fit the arms.
     """
     from dolfinopt.arms.arm import build_arms, uniform_design
-    from dolfinopt.parallel import partition_arms
 
     scene = on_root(world, under_law_of, scene, design)
     partition = partition_arms(world, scene.cell_counts, undivided=scene.dimension == 2)
-    arms = build_arms(scene, partition, profile)
+    arms = build_arms(scene, partition, profile or Profile())
     if design is None:
         x_phys = uniform_design(scene, partition, arms)
     else:

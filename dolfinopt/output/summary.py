@@ -342,12 +342,12 @@ def _machine(trajectory: Trajectory) -> dict[str, Any]:
     """Return masses, drives and residual vibration; of machines control errors and reactions."""
     scene, bodies = trajectory.scene, trajectory.mechanism.arms
     peak, rms = trajectory.drives
-    pairs = zip(bodies, scene.owners, strict=True)
+    masses = {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)}
     result = {
         "max_rotation": trajectory.max_rotation,
         "settling": trajectory.settling,
-        "mass": {arm.name: body.mass for arm, body in zip(scene.arms, bodies, strict=True)},
-        "designed_mass": float(sum(body.mass for body, owner in pairs if owner is not None)),
+        "mass": masses,
+        "designed_mass": float(sum(masses[arm.name] for arm in scene.arms if arm.flexible)),
         "drive_peak": by_drive(scene, peak),
         "drive_rms": by_drive(scene, rms),
     }

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dolfinopt.data import tables_of
 from dolfinopt.disk import read_arrays, write_arrays, write_table
+from dolfinopt.dynamics.build import Trajectory
 from dolfinopt.dynamics.measured import FILE_ROUNDING
 from dolfinopt.multibody.tree import moves
 from dolfinopt.scene.load import Scene
@@ -19,9 +19,6 @@ from dolfinopt.scene.tables.joints import joint_drives
 # Units of summary.json and history.csv by what they are in.
 UNITS = tables_of("output/units.toml")
 FORCE_OF = {"m": "N", "rad": "N m"}  # what drives a coordinate of this unit
-
-if TYPE_CHECKING:
-    from dolfinopt.dynamics.build import Trajectory
 
 
 def write_trajectory(

@@ -346,8 +346,7 @@ TOLERANCE = TABLE["tolerance"]
 TEXTS = ("name", "statement", "paper", "found", "criterion", "reason", "demand")
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """One statement of the paper, see statements.toml.
 
     Attributes:

@@ -162,12 +162,12 @@ def parts_figure(
     for axes, part, cells, mass in zip(rows, plates, corners, masses, strict=True):
         loops, shape = _loops(part), part.shape
         if own:
-            closed = [Path(np.vstack([loop, loop[:1]]), closed=True) for loop in loops]
+            closed = [Path(loop, closed=True) for loop in loops]
             axes.add_patch(PathPatch(Path.make_compound_path(*closed), fc=FACE, ec="none"))
         else:
             fill_cells(axes, cells, part.domain.x_phys)
         for loop in loops:
-            axes.plot(*np.vstack([loop, loop[:1]]).T, color=ORANGE, clip_on=False)
+            axes.plot(*loop.T, color=ORANGE, clip_on=False)
         axes.set_title(
             f"{part.name}:  {1e6 * shape.area:.5g} mm\N{SUPERSCRIPT TWO}, {mass:.4g} kg, "
             f"{len(shape.loops) - 1} holes, {len(shape.curves)} curves"
@@ -289,8 +289,12 @@ def _caption(view: ArmView) -> str:
 
 
 def _loops(part: PlanePart) -> list[np.ndarray]:
-    """Return the closed curves of a part as polygons (n, 2), mm; the outline first."""
-    return [MILLI * loop for loop in part.shape.polygons(CHORD * part.domain.cell)]
+    """Return the closed curves of a part as points (n, 2), mm, the last one the first again.
+
+    The outline comes first.
+    """
+    loops = part.shape.polygons(CHORD * part.domain.cell)
+    return [MILLI * np.vstack([loop, loop[:1]]) for loop in loops]
 
 
 # -- polygons: areas and outlines -------------------------------------------------------------

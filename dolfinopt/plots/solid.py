@@ -30,7 +30,6 @@ from dolfinopt.plots.style import (
 
 LEVEL = 0.5  # density from which material is drawn
 STEEL, BAR = "#8fb0cc", "#a8a8a8"  # links, rigid bodies
-Colour = str | tuple[float, float, float]
 SIDES = 60  # of a round bar
 LINE = 2.0  # px
 EDGE = 35.0  # degrees between faces from which an edge stays sharp
@@ -103,18 +102,18 @@ class Studio:
                 look |= {"ambient": 0.85, "diffuse": 0.2, "specular": 0.0}
             self.add(mesh, **look)
 
-    def line(self, points: np.ndarray, colour: Colour) -> None:
+    def line(self, points: np.ndarray, colour: str) -> None:
         """Draw the line through points (n, 3), m; nothing of a single one."""
         if len(points) > 1:
             mesh = pyvista.lines_from_points(points)
             self.plotter.add_mesh(mesh, color=colour, line_width=LINE, lighting=False, **PLAIN)
 
-    def bar(self, ends: np.ndarray, radius: float, colour: Colour = BAR) -> None:
-        """Draw a round bar between two points (2, 3), m; nothing where they coincide."""
-        if not np.allclose(*ends):
-            self.add(pyvista.Line(*ends).tube(radius=radius, n_sides=SIDES), color=colour)
+    def bar(self, start: np.ndarray, end: np.ndarray, radius: float, colour: str) -> None:
+        """Draw a round bar between two points (3,), m; nothing where they coincide."""
+        if not np.allclose(start, end):
+            self.add(pyvista.Line(start, end).tube(radius=radius, n_sides=SIDES), color=colour)
 
-    def ball(self, centre: np.ndarray, radius: float, colour: Colour) -> None:
+    def ball(self, centre: np.ndarray, radius: float, colour: str) -> None:
         """Draw a sphere."""
         self.add(pyvista.Sphere(radius=radius, center=centre), color=colour)
 

@@ -60,10 +60,9 @@ class SolidStage:
         self.axes.set_axis_off()
         self._draw_ruler(low, high - low)
         self.studio = Studio(self.camera, self.axes)
-        plate = np.stack([foot - ROD * self.size * self.up, foot])
-        self.studio.bar(plate, PLATE * self.size, "#e4e4e4")
+        self._bar(foot - ROD * self.size * self.up, foot, PLATE, "#e4e4e4")
         for place in poses.origin[0, [parent == GROUND for parent in poses.parents]]:
-            self.studio.bar(np.stack([foot, place]), 2.0 * ROD * self.size)
+            self._bar(foot, place, 2.0 * ROD, BAR)
         self.image = self.studio.show(self.studio.render())
 
     def _foot(self) -> np.ndarray:
@@ -130,7 +129,7 @@ class SolidStage:
 
     def _bar(self, start: np.ndarray, end: np.ndarray, radius: float, colour: str) -> None:
         """Draw a round bar; its radius is a share of the machine's size."""
-        self.studio.bar(np.stack([start, end]), radius * self.size, colour)
+        self.studio.bar(start, end, radius * self.size, colour)
 
     def keep(self) -> None:
         """Keep what has been drawn so far in all frames."""

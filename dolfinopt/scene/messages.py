@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import chain
 from typing import Annotated, Any, NamedTuple, get_origin
 
@@ -34,8 +33,7 @@ from dolfinopt.scene.tables.responses import need_of
 COUNTS = {2: "two", 3: "three", 4: "four", 6: "six"}
 
 
-@dataclass(frozen=True)
-class Override:
+class Override(NamedTuple):
     """One --set: its text, and the paths of the keys it changed."""
 
     text: str

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from dolfinopt.data import tables_of
 from dolfinopt.errors import InputError
@@ -26,8 +25,7 @@ OLD_CLOSURE = (
 OLD_KINDS = {"compliance": "integral_compliance", "first_frequency": "eigenfrequency"}
 
 
-@dataclass(frozen=True)
-class OldWord:
+class OldWord(NamedTuple):
     """An older key, see old_words.toml.
 
     Attributes:

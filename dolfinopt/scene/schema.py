@@ -6,6 +6,7 @@ Each table has its file in `tables/`: a key is a field, whose meaning and unit s
 from __future__ import annotations
 
 import copy
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -400,6 +401,11 @@ def scene_schema() -> dict[str, Any]:
     }
     head = {"$schema": "http://json-schema.org/draft-07/schema#", "title": "scene of dolfinopt"}
     return head | schema
+
+
+def schema_text() -> str:
+    """Return it as the text of a file."""
+    return json.dumps(scene_schema(), indent=2) + "\n"
 
 
 class TomlSchema(GenerateJsonSchema):

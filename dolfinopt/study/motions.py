@@ -25,7 +25,6 @@ from dolfinopt.motion.input_shaper import InputShaper, ShaperKind, input_shaper
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.output.feed_forward import finer_deviation, with_feed_forward
 from dolfinopt.output.trajectory import drive_units
-from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene, scene_from_dict
 from dolfinopt.study.cases import Case, Outcome, Steps
 from dolfinopt.study.studies import (
@@ -96,7 +95,7 @@ def _motions(scene: Scene, designs: Sequence[Path | None], folder: Path) -> Rows
     """Return the motions with the first design, and feed-forward with the second."""
     rigid, forward = (_judged(with_feed_forward(scene, kind)) for kind in ("none", "tip"))
     first = designs[0]
-    place = arms_with_design(MPI.COMM_SELF, rigid, first, Profile())
+    place = arms_with_design(MPI.COMM_SELF, rigid, first)
     finer = finer_deviation(place, None) if rigid.reduction.count else None
     labels = {LONGER: 0.0, FINER: 1e3 * (finer or math.nan)}
     rows: Rows = [(labels, Case(rigid, "simulate", first, RIGID))]

@@ -22,7 +22,6 @@ from mpi4py import MPI
 from dolfinopt.errors import InputError
 from dolfinopt.output.design import arms_with_design
 from dolfinopt.plots.panels import Line, Panel
-from dolfinopt.profiling import Profile
 from dolfinopt.scene.load import Scene
 from dolfinopt.study.cases import Case, Outcome, Steps
 from dolfinopt.study.tables import (
@@ -175,7 +174,7 @@ def given_designs(scene: Scene, designs: Sequence[Path]) -> dict[str, Design]:
         for path in designs:
             if not path.is_file():
                 raise InputError(f"{path}: --design: no such file; give design.npz files")
-            arms_with_design(MPI.COMM_SELF, scene, path, Profile())
+            arms_with_design(MPI.COMM_SELF, scene, path)
         names = [path.parent.name if path.stem == "design" else path.stem for path in designs]
         plain = len(set(names)) == len(names)
         return {n if plain else str(p): p for n, p in zip(names, designs, strict=True)}
@@ -291,10 +290,9 @@ def sweep_steps(
     if len(grids) == 1:
         return reported(rows, partial(_sweep_report, keys=asked))
     rows += [
-        ({"role": "base", "design": label},
-         Case(scene, "simulate", design, f"{label}, as it is"))
+        ({"design": label}, Case(scene, "simulate", design, f"{label}, as it is"))
         for label, design in given.items()
-    ]  # fmt: skip
+    ]
     return reported(rows, partial(_several, keys=asked))
 
 
@@ -302,8 +300,8 @@ def _sweep(
     scene: Scene, keys: Sequence[Vary], given: Mapping[str, Design], reoptimize: bool, fits: bool
 ) -> Rows:
     """Return all scenarios of the keys' values for every design."""
-    # Role "shown" is a design in all scenarios; "crossed" the one optimised for scenario number
-    # "made for" in scenario "point", where it fits their arms.
+    # Rows with a design's name are of it in all scenarios; those without are of the design that was
+    # optimised for scenario number "made for", in scenario "point", where it fits their arms.
     swept = ", ".join(vary.key for vary in keys)
     points = []  # labels, scene and columns of each
     for j, values in enumerate(product(*(vary.values for vary in keys))):
@@ -314,26 +312,26 @@ def _sweep(
         columns = {vary.axis: value for vary, value in settings}
         points.append((label, there, {"swept": swept, "point": j} | columns))
 
-    def rows(role: str, name: str, designs: Sequence[Design], made_for: int = -1) -> Rows:
-        known = {"role": role, "design": name * (role == "shown"), "made for": made_for}
+    def rows(name: str, designs: Sequence[Design], made_for: int = -1) -> Rows:
+        known = {"design": name * (made_for < 0), "made for": made_for}
         return [
             (known | columns, Case(there, "simulate", design, f"{name}, {label}"))
             for (label, there, columns), design in zip(points, designs, strict=True)
         ]
 
-    result = [row for n, d in given.items() for row in rows("shown", n, [d] * len(points))]
+    result = [row for n, d in given.items() for row in rows(n, [d] * len(points))]
     if reoptimize:
         optima = [Case(there, "optimize", label=f"optimised, {n}") for n, there, _ in points]
-        result += rows("shown", MADE, optima)
+        result += rows(MADE, optima)
         for i, (label, *_) in enumerate(points if fits else ()):
-            result += rows("crossed", f"made for {label}", [optima[i]] * len(points), i)
+            result += rows(f"made for {label}", [optima[i]] * len(points), i)
     return result
 
 
 def _sweep_report(frame: pd.DataFrame, keys: Sequence[Vary], prefix: str = "") -> Report:
     """Return tables and figures of one key, or two in a grid; `prefix` is part of their names."""
     axes = [vary.axis for vary in keys]
-    shown = frame[frame["role"] == "shown"]
+    shown = frame[frame["design"] != ""]
     table = by_design(shown, axes)
     failed = shown.groupby("point")["failure"].agg(lambda s: "; ".join(s[s != ""].unique()))
     if (failed != "").any():
@@ -366,7 +364,7 @@ def _cross(
     """Return design i in scenario j, and what it loses against the one made for j; or nothing."""
     labels = [", ".join(f"{value:g}" for value in point) for point in points.to_numpy()]
     axis, tables, losses = ", ".join(points.columns), [], {}
-    crossed = frame[frame["role"] == "crossed"]
+    crossed = frame[frame["design"] == ""]
     for what in QUANTITIES if len(crossed) else ():
         values = crossed.pivot(index="made for", columns="point", values=what).to_numpy()
         quantity = what.partition(" [")[0]
@@ -402,8 +400,8 @@ def _several(frame: pd.DataFrame, keys: Sequence[Vary]) -> Report:
     tables: list[Table] = []
     figures: list[Figure] = []
     rows = []
-    shown = frame[frame["role"] == "shown"].groupby(["design", "swept"])
-    bases = frame[frame["role"] == "base"].set_index("design")
+    shown = frame.groupby(["design", "swept"])
+    bases = frame[frame["swept"].isna()].set_index("design")
     for vary in keys:
         more = _sweep_report(frame[frame["swept"] == vary.key], [vary], vary.key)
         tables, figures = tables + more[0], figures + more[1]
@@ -497,14 +495,13 @@ def reduction_steps(scene: Scene, counts: Sequence[int] | None) -> Steps[Study]:
     for other in reductions(scene, counts, OPTIMISED):
         optimised = Case(other, "optimize", label=reduction_name(other))
         again = Case(reference, "simulate", optimised, f"{optimised.label} in {called}")
-        rows += [(_reduction(other) | {"role": "own"}, optimised)]
-        rows += [(_reduction(other) | {"role": "again"}, again)]
+        rows += [(_reduction(other), case) for case in (optimised, again)]
     return reported(rows, partial(_reductions, called=called))
 
 
 def _reductions(frame: pd.DataFrame, called: str) -> Report:
     """Return the designs' results in their own model and in the reference."""
-    own, again = (frame[frame["role"] == role].reset_index() for role in ("own", "again"))
+    own, again = (frame[k::2].reset_index() for k in range(2))  # in pairs
     ended = own["ended by"].where((own["failure"] != "") | (again["failure"] == ""),
                                   again["ended by"])  # fmt: skip
     known = {"method": own["method"], "coordinates": own["coordinates"]}

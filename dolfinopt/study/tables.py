@@ -18,7 +18,6 @@ from dolfinopt.disk import write_text
 from dolfinopt.plots.panels import Panel
 from dolfinopt.scene.load import Scene
 
-Cell = str | int | float
 LONGEST = 120  # characters of a study's name, which file names begin with
 
 

@@ -296,8 +296,7 @@ REDUCED = 5  # of those that are meshed and reduced anew, which take longer
 INTERVAL = f"{100.0 * CONFIDENCE:g} % confidence intervals"
 
 
-@dataclass(frozen=True)
-class Input:
+class Input(NamedTuple):
     """A scene value, what the scene says of it, and its distribution within the key's range."""
 
     key: str

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,8 +33,7 @@ MOST = {"balanced": 12}
 # -- values ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Vary:
+class Vary(NamedTuple):
     """One scene value by its path, the numbers it takes, and the text that asks for it."""
 
     key: str

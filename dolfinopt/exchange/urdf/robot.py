@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -41,8 +41,7 @@ Point = tuple[float, float, float]
 MOVABLE = ("revolute", "continuous", "prismatic")
 
 
-@dataclass(frozen=True, eq=False)
-class Mimic:
+class Mimic(NamedTuple):
     """A joint that follows another: q = multiplier * q_joint + offset."""
 
     joint: str
@@ -243,12 +242,14 @@ SHORTEST = 1e-3  # m of a solid
 PARALLEL = 1e-6  # sine of the angle between axes
 
 
-# A solid's frame in its link's, its length, the sides of its box, and whether these are measured.
-Solid = tuple[np.ndarray, float, tuple[float, float], bool]
+def solid_of(
+    robot: Robot, name: str, tool: str
+) -> tuple[np.ndarray, float, tuple[float, float], bool]:
+    """Return frame and box of a chosen link as a solid.
 
-
-def solid_of(robot: Robot, name: str, tool: str) -> Solid:
-    """Return the frame and box of a chosen link."""
+    The frame (4, 4) in the link's, the length and the sides of the box, m, and whether these are
+    measured.
+    """
     inner = robot.holder[name]
     outer, pose = _next_joint(robot, name, tool)
     first, last = _interfaces(robot, inner, outer, pose, name)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -233,8 +233,7 @@ def cells_of(length: float, height: float, thickness: float) -> tuple[int, int, 
     return max(1, along), max(FEWEST, across[0]), max(FEWEST, across[1])
 
 
-@dataclass(frozen=True)
-class _Extent:
+class _Extent(NamedTuple):
     """A solid as it stands in the scene."""
 
     sides: tuple[float, float]  # height and thickness, m
