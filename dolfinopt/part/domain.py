@@ -394,8 +394,8 @@ class Filled:
             return []
         return [
             f"arm {self.name!r}: {count} piece{'s' * (count > 1)} without a joint to both "
-            f"interfaces ({MM**dim * size:.3g} mm{dim}, {100.0 * size / self.volume:.2g} % of the volume) "
-            "left out"
+            f"interfaces ({MM**dim * size:.3g} mm{dim}, {100.0 * size / self.volume:.2g} % of the "
+            "volume) left out"
         ]
 
     @property
