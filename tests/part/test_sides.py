@@ -11,7 +11,7 @@ from parts import frame
 from dolfinopt.errors import InputError
 from dolfinopt.part.part import Curves
 from dolfinopt.part.plane.curves import Arc, Line, Spline, angle_of
-from dolfinopt.part.plane.limits import Limits, rounded_radii, struts
+from dolfinopt.part.plane.limits import Limits, struts
 from dolfinopt.part.plane.part import make_part
 from dolfinopt.part.plane.sides import Circle, Corner, Loop, Side, Sides
 from dolfinopt.part.program import least_move, solve
@@ -142,18 +142,6 @@ def test_nearest_outline_keeps_the_limits_and_an_area():
         assert LIMITS.rows(found)[0].max() < 3e-6
         assert 1e-3 < np.abs(step).max() < 1e-2  # m
         assert area is None or found.shape.area == pytest.approx(area, rel=1e-5)
-
-
-def test_rounded_radii_are_whole_half_millimetres():
-    made = rounded_radii(LIMITS.nearest(bracket())[0], LIMITS)
-    radii = [
-        one.piece.curve.radius
-        for one in made.placed
-        if one.piece.free and isinstance(one.piece.curve, Arc)
-    ]
-    assert len(radii) == 5
-    steps = np.array(radii) / 5e-4
-    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
 
 
 def test_shortest_move_is_that_of_the_book():
