@@ -213,7 +213,8 @@ def _free(scene: Scene, k: int, part: Part) -> FreeSides:
     smallest, tool = min([1.0, *sizes]), flat.outline.tool_radius
     limits = limits_of_part(flat.domain, tool, scene.design.minimum_gap, smallest)
     free = FreeSides(flat, flat.sides, limits, part.domain if isinstance(part, SolidPart) else None)
-    return (free.nearest() or (free,))[0]
+    result = free.nearest()
+    return free if result is None else result[0]
 
 
 def _rank(scene: Scene, result: Found) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from parts import frame
 from dolfinopt.errors import InputError
 from dolfinopt.part.part import Curves
 from dolfinopt.part.plane.curves import Arc, Line, Spline, angle_of
-from dolfinopt.part.plane.limits import WEDGE, Limits, struts
+from dolfinopt.part.plane.limits import Limits, struts
 from dolfinopt.part.plane.part import make_part
 from dolfinopt.part.plane.sides import Circle, Corner, Loop, Side, Sides
 from dolfinopt.part.program import least_move, solve
@@ -124,7 +124,6 @@ def test_sides_of_a_strut_become_parallel():
         blade = (Side(p + 0.5 * d, angle_of(d)) for p, d in zip(places, ways, strict=True))
         sides = Sides((Loop(tuple(blade), corners(*places)),)).centred()
         limits = replace(LIMITS, member=1e-3, arm=shapely.box(-1, -1, 1, 1), stays=shapely.Point())
-        limits = replace(limits, almost=WEDGE)
         assert len(struts(sides)[0]) == rows
         found, _ = limits.nearest(sides)
         assert (np.abs(struts(found)[2]) < 1e-3).all()

@@ -34,7 +34,7 @@ from dolfinopt.part.plane.curves import (
     turn_between,
     unit,
 )
-from dolfinopt.part.plane.limits import MOST_TURN, SHORT, TURN, WEDGE, Limits
+from dolfinopt.part.plane.limits import MOST_TURN, SHORT, TURN, Limits
 from dolfinopt.part.plane.outline import Outline
 from dolfinopt.part.plane.sides import (
     BrokenError,
@@ -96,7 +96,6 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
     Raises:
         InputError: there are no sides without crossings that keep the limits.
     """
-    limits = replace(limits, almost=WEDGE)
     for halvings in range(HALVINGS):
         drawn = _drawn(outline, limits, 0.5**halvings * tolerance)
         with suppress(BrokenError):

@@ -56,9 +56,8 @@ CHORD = 0.005  # distance of polygons from curves, cells
 # solid cells that share a corner are joined in the finite elements. Without them a light arm has 12
 # holes of 17, and the search from there ends 10 % heavier.
 LINK = 0.5
-# Angle of two sides up to which they are those of a strut in a fit; later on, as no step may turn a
-# side by more for a strut that comes to be; and to which they are parallel.
-WEDGE, ALMOST, PARALLEL = np.radians([10.0, 0.5, 0.05])
+# Angle of two sides up to which they are those of a strut, and to which they are parallel.
+ALMOST, PARALLEL = np.radians(10.0), np.radians(0.05)
 KEPT = 2e-6  # m, up to which a limit may be missed
 FAR = 0.6  # cells that a side's end, or a radius, moves in a step, at most
 STEPS = 20  # of them, at most
@@ -76,7 +75,6 @@ class Limits:
         member, gap: least widths, m.
         arm, stays: where material may be, and where it must be (shapely).
         scale: of the smallest arm that has this design.
-        almost: angle of two sides up to which they are those of a strut, rad.
     """
 
     cell: float
@@ -86,7 +84,11 @@ class Limits:
     arm: Geometry
     stays: Geometry
     scale: float = 1.0
-    almost: float = ALMOST
+
+    @property
+    def _reach(self) -> float:
+        """At which turns count as lengths, m."""
+        return 4.0 * self.cell
 
     def rows(self, sides: Sides) -> Rows:
         """Return g (m,), m, which must not be positive, and its derivatives (m, count) by x.
@@ -94,8 +96,8 @@ class Limits:
         Raises:
             BrokenError: sides do not close to a loop.
         """
-        kinds = self._of_pieces, self._turns, self._widths, self._struts, self._places
-        result = [row for kind in kinds for row in kind(sides)]
+        result = [*self._of_pieces(sides), *self._turns(sides)]
+        result += [*self._widths(sides), *self._struts(sides), *self._places(sides)]
         if not result:
             return np.empty(0), np.empty((0, sides.count))
         values, slopes = zip(*result, strict=True)
@@ -105,10 +107,9 @@ class Limits:
 
     def _turns(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         """Yield the rows of the corners' turns, as lengths."""
-        reach = 4.0 * self.cell
         for turn, slope in sides.turns:
-            yield reach * (TURN - turn), -reach * slope
-            yield reach * (turn - MOST_TURN), reach * slope
+            yield self._reach * (TURN - turn), -self._reach * slope
+            yield self._reach * (turn - MOST_TURN), self._reach * slope
 
     def _of_pieces(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         """Yield the rows of lengths and radii, as the smallest arm of the design needs them.
@@ -150,10 +151,9 @@ class Limits:
 
     def _struts(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         """Yield the rows of the angles between both sides of every strut, as lengths."""
-        reach = 4.0 * self.cell
-        turns = reach * np.eye(sides.numbers[0])
-        for one, other, angle in zip(*struts(sides, self.almost), strict=True):
-            yield reach * (angle - PARALLEL), turns[one] - turns[other]
+        turns = self._reach * np.eye(sides.numbers[0])
+        for one, other, angle in zip(*struts(sides), strict=True):
+            yield self._reach * (angle - PARALLEL), turns[one] - turns[other]
 
     # -- where material may be and must be --------------------------------------------------------
 
@@ -209,15 +209,14 @@ class Limits:
         return None
 
 
-def struts(sides: Sides, almost: float = WEDGE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def struts(sides: Sides) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the turns among q of the two sides of struts (k,), and their angles (k,), rad.
 
     These are the nearest lines across material that face each other along more than their distance
     and half of both. Every strut is there twice, with either side as the first one.
     """
-    lines = [
-        item for item in sides.placed if item.piece.free and isinstance(item.piece.curve, Line)
-    ]
+    moving = [item for item in sides.placed if item.piece.free]
+    lines = [item for item in moving if isinstance(item.piece.curve, Line)]
     turns = np.array([sides.numbers[1][item.loop, item.side] + 1 for item in lines], dtype=int)
     ends = np.array([(item.piece.curve.start, item.piece.curve.end) for item in lines])
     ends = ends.reshape(-1, 2, 2) @ [1.0, 1.0j]
@@ -227,7 +226,7 @@ def struts(sides: Sides, almost: float = WEDGE) -> tuple[np.ndarray, np.ndarray,
     shared = -np.diff(np.clip(seen.real, 0.0, length[..., None]))[..., 0]
     width, angle = seen.imag.mean(axis=2), np.angle(-way / way.T)
     faces = (width > 0.0) & (shared > np.maximum(width, 0.5 * length))
-    width = np.where(faces & faces.T & (np.abs(angle) < almost), width, np.inf)
+    width = np.where(faces & faces.T & (np.abs(angle) < ALMOST), width, np.inf)
     nearest = np.isfinite(width) & (width <= width.min(axis=1, initial=np.inf, keepdims=True))
     one, other = np.nonzero(nearest | nearest.T)
     return turns[one], turns[other], angle[one, other]
@@ -286,7 +285,7 @@ def rounded_radii(sides: Sides, limits: Limits) -> Sides:
     circles = tuple(replace(circle, radius=rounded(circle.radius)) for circle in sides.circles)
     even = replace(even, circles=circles, holds_radii=True)
     result = limits.nearest(even, area=sides.shape.area) or limits.nearest(even)
-    return replace((result or (sides,))[0], holds_radii=False)
+    return sides if result is None else replace(result[0], holds_radii=False)
 
 
 def with_radii(sides: Sides, of: Callable[[float], float]) -> Sides:
