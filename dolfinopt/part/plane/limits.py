@@ -152,8 +152,8 @@ class Limits:
     def _struts(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         """Yield the rows of the angles between both sides of every strut, as lengths."""
         turns = self._reach * np.eye(sides.numbers[0])
-        for one, other, angle in zip(*struts(sides), strict=True):
-            yield self._reach * (angle - PARALLEL), turns[one] - turns[other]
+        for first, second, angle in zip(*struts(sides), strict=True):
+            yield self._reach * (angle - PARALLEL), turns[first] - turns[second]
 
     # -- where material may be and must be --------------------------------------------------------
 
@@ -228,8 +228,8 @@ def struts(sides: Sides) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     faces = (width > 0.0) & (shared > np.maximum(width, 0.5 * length))
     width = np.where(faces & faces.T & (np.abs(angle) < ALMOST), width, np.inf)
     nearest = np.isfinite(width) & (width <= width.min(axis=1, initial=np.inf, keepdims=True))
-    one, other = np.nonzero(nearest | nearest.T)
-    return turns[one], turns[other], angle[one, other]
+    first, second = np.nonzero(nearest | nearest.T)
+    return turns[first], turns[second], angle[first, second]
 
 
 def interfaces(domain: Domain) -> list[Geometry]:
