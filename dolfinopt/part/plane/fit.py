@@ -45,6 +45,7 @@ from dolfinopt.part.plane.sides import (
     Sides,
     meet,
 )
+from dolfinopt.part.plane.struts import with_struts
 
 # Length of a side that is worth drawing, cells: down to the least that limits allow a rod and a
 # SCARA's fore arm have 10 to 45 % more sides.
@@ -97,8 +98,8 @@ def fitted_sides(outline: Outline, limits: Limits, tolerance: float, area: float
         InputError: there are no sides without crossings that keep the limits.
     """
     for halvings in range(HALVINGS):
-        drawn = _drawn(outline, limits, 0.5**halvings * tolerance)
         with suppress(BrokenError):
+            drawn = with_struts(_drawn(outline, limits, 0.5**halvings * tolerance))
             result = limits.nearest(drawn, area=area) or limits.nearest(drawn)
             if result is not None:  # from where limits are kept the area is in reach more often
                 return (limits.nearest(result[0], area=area) or result)[0]

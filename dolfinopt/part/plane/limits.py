@@ -56,8 +56,6 @@ CHORD = 0.005  # distance of polygons from curves, cells
 # solid cells that share a corner are joined in the finite elements. Without them a light arm has 12
 # holes of 17, and the search from there ends 10 % heavier.
 LINK = 0.5
-# Angle of two sides up to which they are those of a strut, and to which they are parallel.
-ALMOST, PARALLEL = np.radians(10.0), np.radians(0.05)
 KEPT = 2e-6  # m, up to which a limit may be missed
 FAR = 0.6  # cells that a side's end, or a radius, moves in a step, at most
 STEPS = 20  # of them, at most
@@ -85,19 +83,14 @@ class Limits:
     stays: Geometry
     scale: float = 1.0
 
-    @property
-    def _reach(self) -> float:
-        """At which turns count as lengths, m."""
-        return 4.0 * self.cell
-
     def rows(self, sides: Sides) -> Rows:
         """Return g (m,), m, which must not be positive, and its derivatives (m, count) by x.
 
         Raises:
             BrokenError: sides do not close to a loop.
         """
-        result = [*self._of_pieces(sides), *self._turns(sides)]
-        result += [*self._widths(sides), *self._struts(sides), *self._places(sides)]
+        kinds = self._of_pieces, self._turns, self._widths, self._places
+        result = [row for kind in kinds for row in kind(sides)]
         if not result:
             return np.empty(0), np.empty((0, sides.count))
         values, slopes = zip(*result, strict=True)
@@ -107,9 +100,10 @@ class Limits:
 
     def _turns(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         """Yield the rows of the corners' turns, as lengths."""
+        reach = 4.0 * self.cell
         for turn, slope in sides.turns:
-            yield self._reach * (TURN - turn), -self._reach * slope
-            yield self._reach * (turn - MOST_TURN), self._reach * slope
+            yield reach * (TURN - turn), -reach * slope
+            yield reach * (turn - MOST_TURN), reach * slope
 
     def _of_pieces(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
         """Yield the rows of lengths and radii, as the smallest arm of the design needs them.
@@ -148,12 +142,6 @@ class Limits:
             group = np.unique(pairs, axis=0, return_inverse=True)[1].ravel()
             chosen = near[_least_of_each(group, width[near])]
             yield from zip(least - width[chosen], result.by_q(chosen, sides.numbers[0]))
-
-    def _struts(self, sides: Sides) -> Iterator[tuple[float, np.ndarray]]:
-        """Yield the rows of the angles between both sides of every strut, as lengths."""
-        turns = self._reach * np.eye(sides.numbers[0])
-        for first, second, angle in zip(*struts(sides), strict=True):
-            yield self._reach * (angle - PARALLEL), turns[first] - turns[second]
 
     # -- where material may be and must be --------------------------------------------------------
 
@@ -207,29 +195,6 @@ class Limits:
             except BrokenError:
                 return None
         return None
-
-
-def struts(sides: Sides) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the turns among q of the two sides of struts (k,), and their angles (k,), rad.
-
-    These are the nearest lines across material that face each other along more than their distance
-    and half of both. Every strut is there twice, with either side as the first one.
-    """
-    moving = [item for item in sides.placed if item.piece.free]
-    lines = [item for item in moving if isinstance(item.piece.curve, Line)]
-    turns = np.array([sides.numbers[1][item.loop, item.side] + 1 for item in lines], dtype=int)
-    ends = np.array([(item.piece.curve.start, item.piece.curve.end) for item in lines])
-    ends = ends.reshape(-1, 2, 2) @ [1.0, 1.0j]
-    way = (ends[:, 1] - ends[:, 0])[:, None]
-    length = np.abs(way)
-    seen = (ends - ends[:, None, :1]) * (way.conj() / length)[..., None]  # along each, to its left
-    shared = -np.diff(np.clip(seen.real, 0.0, length[..., None]))[..., 0]
-    width, angle = seen.imag.mean(axis=2), np.angle(-way / way.T)
-    faces = (width > 0.0) & (shared > np.maximum(width, 0.5 * length))
-    width = np.where(faces & faces.T & (np.abs(angle) < ALMOST), width, np.inf)
-    nearest = np.isfinite(width) & (width <= width.min(axis=1, initial=np.inf, keepdims=True))
-    first, second = np.nonzero(nearest | nearest.T)
-    return turns[first], turns[second], angle[first, second]
 
 
 def interfaces(domain: Domain) -> list[Geometry]:

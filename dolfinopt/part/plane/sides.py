@@ -19,7 +19,7 @@ with t_i along side i, n'_i its normal turned by a right angle and m_i the middl
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -248,12 +248,14 @@ class Sides:
         circles: round holes that move.
         fixed: loops of the arm's own curves: bores.
         holds_radii: whether radii stay as they are.
+        struts: key of the side, of the same strut, with which each of them turns, by its key.
     """
 
     loops: Loops
     circles: tuple[Circle, ...] = ()
     fixed: tuple[tuple[Piece, ...], ...] = ()
     holds_radii: bool = False
+    struts: Mapping[int, int] = field(default_factory=dict)
 
     @cached_property
     def numbers(self) -> tuple[int, Mapping[tuple[int, int], int], Mapping[tuple[int, int], int]]:
@@ -413,23 +415,24 @@ class Sides:
             loops.append(Loop(tuple(sides), tuple(corners)))
         return replace(self, loops=tuple(loops))
 
-    # -- ties: mirror images ---------------------------------------------------------------------
+    # -- ties: mirror images and struts ----------------------------------------------------------
 
     @cached_property
     def ties(self) -> np.ndarray:
         """T (n, count) with q = T x; x are lengths, m; of turns what fillets move, too."""
         count, sides, corners = self.numbers
-        every, named = np.arange(count), list(self._names)
+        named = list(self._names)
         at = {name: j for j, (name, _, _) in enumerate(named)}
-        image = np.array([at.get(twin, j) for j, (_, twin, _) in enumerate(named)], dtype=int)
+        own = np.array([at[name] for name, _, _ in named], dtype=int)
+        image = np.array([at.get(twin, at[name]) for name, twin, _ in named], dtype=int)
         sign = np.array([sign if twin in at else 1.0 for _, twin, sign in named])
-        held = (image == every) & (sign < 0.0)
+        held = (image == own) & (sign < 0.0)
         if self.holds_radii:
             held[[*corners.values(), *range(self.of_circles + 2, count, 3)]] = True
-        first, rows = np.minimum(image, every), np.flatnonzero(~held)
+        first, rows = np.minimum(image, own), np.flatnonzero(~held)
         known, column = np.unique(first[rows], return_inverse=True)
         T = np.zeros((count, len(known)))
-        T[rows, column] = np.where(rows == known[column], 1.0, sign[rows])
+        T[rows, column] = np.where(own[rows] == known[column], 1.0, sign[rows])
         half = np.ones(count)
         # By its end alone a side of a twentieth of a cell turned by 50 degrees in a step: a hole of
         # three such sides held up all others, and lightest arms spent 80 steps and 333 s of CPU.
@@ -445,8 +448,9 @@ class Sides:
         for loop in self.loops:
             for side in loop.sides:
                 if side.free:
+                    key, twin = (self.struts.get(name, name) for name in (side.key, side.twin))
                     yield (side.key, "offset"), (side.twin, "offset"), 1.0
-                    yield (side.key, "turn"), (side.twin, "turn"), -1.0
+                    yield (key, "turn"), (twin, "turn"), -1.0
             for k, corner in enumerate(loop.corners):
                 if corner.radius > 0.0:
                     before, after = loop.sides[k - 1], loop.sides[k]
