@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,15 +54,8 @@ def lowest_buckling(
             loads = [item.at(np.array([n])) for item in loads if (item.place, item.motion) == here]
         if not loads:
             continue
-        # All motions one after the other: what is worst along one tells of the others, too.
-        coefficients = np.concatenate([item.coefficients / item.stiffer for item in loads])
-        of = np.repeat(range(len(loads)), [len(item.instants) for item in loads])
-        every = replace(
-            loads[0], coefficients=coefficients, stiffer=1.0, instants=np.arange(len(coefficients))
-        )
-        for each in pressed(arms[k].current, every):
-            load = loads[of[each.instant]]
-            n = load.instants[each.instant - int(np.argmax(of == of[each.instant]))]
+        for each in pressed(arms[k].current, loads):
+            load, n = each.loads, each.loads.instants[each.instant]
             mu, t = float(each.modes.inverse[0]), float(motions[load.motion].t[n])
             factor = 1.0 / mu if mu * LARGEST_FACTOR > 1.0 else float("inf")
             result.append(LeastBuckling(factor, load.place, t, load.motion))

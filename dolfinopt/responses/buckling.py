@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 from scipy.signal import find_peaks
@@ -66,25 +66,26 @@ class Pressed:
         return np.asarray(self.loads.coefficients[self.instant] / self.loads.stiffer)
 
 
-def pressed(state: DesignState, loads: ArmLoads) -> list[Pressed]:
-    """Return the instants that count (collective on the arm's ranks).
+def pressed(state: DesignState, loads: Sequence[ArmLoads]) -> list[Pressed]:
+    """Return the instants of all motions that count (collective on the arm's ranks).
 
     The modes at the extremes of the loads tell at any other instant that mu is at least their Ritz
     value: the instants that count are where that has its peaks.
     """
-    a, fields = loads.coefficients / loads.stiffer, state.load_fields
-    modulus = stressed_modulus(state)
+    every = [(load, n) for load in loads for n in range(len(load.coefficients))]
+    a = np.concatenate([load.coefficients / load.stiffer for load in loads])
+    fields, modulus = state.load_fields, stressed_modulus(state)
 
-    @cache
-    def modes_at(n: int) -> BucklingModes:
+    def modes_at(n: int, least: float) -> BucklingModes:
         stress = Prestress(fields, modulus, a[n : n + 1])
-        return buckling_modes(stress, BUCKLING_MODES, 1.0 / LARGEST_FACTOR)
+        with state.elastic.profile.phase("buckling"):
+            return buckling_modes(stress, BUCKLING_MODES, least)
 
     first = extreme_instants(a, state.elastic.energy_matrix(fields.columns))
     if not first:
         return []
-    peaks = worst_instants(_ritz(state, a, [modes_at(n) for n in first]))
-    return [Pressed(loads, n, modes_at(n)) for n in peaks]
+    peaks = worst_instants(_ritz(state, a, [modes_at(n, np.inf) for n in first]))  # rough modes
+    return [Pressed(*every[n], modes_at(n, 1.0 / LARGEST_FACTOR)) for n in peaks]
 
 
 def extreme_instants(a: np.ndarray, energies: np.ndarray) -> list[int]:
@@ -141,20 +142,15 @@ def _ritz(state: DesignState, a: np.ndarray, known: Sequence[BucklingModes]) -> 
     return on_root(arm.comm, largest)
 
 
-def _of_design(state: DesignState, loads: Sequence[ArmLoads]) -> list[Pressed]:
-    """Return the instants of all arms with a design (collective on its ranks)."""
-    with state.elastic.profile.phase("buckling"):
-        return [each for load in loads for each in pressed(state, load)]
-
-
 # -- as objective and as limit -------------------------------------------------------------------
 
 
 @response("buckling")
 class Buckling(Response):
-    """p-norm of 1 / factor over arms, scenarios, their worst instants and modes; true: the factor.
+    """p-norm of 1 / factor over arms, their worst instants and modes; true: the factor.
 
-    Instants are peaks over time, up to three of every arm, of each the four lowest modes. That
+    Instants are peaks over the times of all scenarios, up to three of every arm, of each the four
+    lowest modes. That
     nothing buckles is a factor of 1000, and of no influence.
     """
 
@@ -184,7 +180,7 @@ class Buckling(Response):
         def find() -> dict[int, list[Pressed]]:
             every = on_root(world, lambda: arm_loads(analysis.scene, motions_of(analysis.motion)))
             with together(world):
-                return {k: _of_design(state, every[k]) for k, state in designs.items()}
+                return {k: pressed(state, every[k]) for k, state in designs.items()}
 
         return self.once(analysis, find)
 
