@@ -78,20 +78,18 @@ def ending_at_once() -> Iterator[None]:
 
 @contextmanager
 def interrupted_later() -> Iterator[None]:
-    """Let Ctrl-C raise KeyboardInterrupt after the block, which must be short."""
-    before = signal.getsignal(signal.SIGINT)
-    if (
-        before is not signal.default_int_handler
-        or threading.current_thread() is not threading.main_thread()
-    ):
-        yield
-        return
-    pressed = threading.Event()
-    signal.signal(signal.SIGINT, lambda *_: pressed.set())
+    """Let what raises KeyboardInterrupt, Ctrl-C among others, do so after a short block."""
+    pressed, held = threading.Event(), list[int]()
+    if threading.current_thread() is threading.main_thread():
+        both = signal.SIGINT, signal.SIGTERM
+        held = [n for n in both if signal.getsignal(n) is signal.default_int_handler]
+    for number in held:
+        signal.signal(number, lambda *_: pressed.set())
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number in held:
+            signal.signal(number, signal.default_int_handler)
     if pressed.is_set():
         raise KeyboardInterrupt
 

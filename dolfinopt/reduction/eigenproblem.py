@@ -14,6 +14,7 @@ from dolfinopt.errors import ConvergenceError
 from dolfinopt.fem.elasticity import ElasticArm, Rows
 from dolfinopt.fem.measured import ENERGY_TOLERANCE, ROUNDING_SHARE, SOLVER_ITERATIONS
 from dolfinopt.fem.multigrid import Columns
+from dolfinopt.interrupt import interrupted_later
 from dolfinopt.parallel import total
 from dolfinopt.reduction.measured import EIGENVALUE_GAP, LOST_MODE_SHARE, RAMP_SHARE, WARM_STEPS
 from dolfinopt.solver import obeying_options, user_options
@@ -392,7 +393,8 @@ def _krylov_schur(
                 given += space
             eps.setDimensions(min(count, pencil.size), min(size, pencil.size))
             eps.setTolerances(tolerance, restarts)
-            with obeying_options(OPTIONS):
+            # Ended within a product, SLEPc could not be destroyed any more.
+            with obeying_options(OPTIONS), interrupted_later():
                 eps.setFromOptions()
                 eps.solve()
             converged = min(eps.getConverged(), count)

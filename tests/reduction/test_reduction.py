@@ -2,6 +2,8 @@
 
 import dataclasses
 import gc
+import itertools
+import signal
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 import scipy.integrate
 import scipy.linalg
 from mpi4py import MPI
+from petsc4py import PETSc
 from remainders import substructure
 
 from dolfinopt.errors import ConvergenceError
@@ -21,6 +24,7 @@ from dolfinopt.reduction.eigenproblem import (
     Pencil,
     _passes_over,
     complement_solve,
+    largest_eigenpairs,
     lowest_eigenpairs,
 )
 
@@ -185,6 +189,16 @@ def test_modes_keep_the_interfaces(shared_arm, method):
 def test_too_many_modes_are_an_error_that_says_so():
     with pytest.raises(ConvergenceError, match=r"arm 'arm': only \d+ of 5.*reduction\.coordinates"):
         lowest_eigenpairs(Pencil(with_densities(make_arm((2, 1)), uniform)), 5, None)
+
+
+def test_interrupt_waits_for_an_eigenproblem():
+    """Ended within its second product, SLEPc could not be destroyed any more."""
+    calls = itertools.cycle([int, signal.raise_signal])
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    with pytest.raises(KeyboardInterrupt):
+        pencil = Pencil(with_densities(make_arm(comm=SELF), uniform))
+        largest_eigenpairs(pencil, lambda rows: (rows, next(calls)(2))[0], 1, 1e-4)
+    PETSc.garbage_cleanup(SELF)
 
 
 @pytest.mark.parametrize(

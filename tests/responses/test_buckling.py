@@ -124,11 +124,11 @@ def test_pressure_is_found_between_stronger_tension(bar):
     t = np.linspace(0.0, 1.0, 101)
     size = 3e3 * np.sin(4.0 * np.pi * t) ** 2 * np.where((t > 0.5) & (t < 0.75), -0.3, 1.0)
     a = size[:, None] * under(state, FORCE, 1.0).a
-    found = pressed(state, [ArmLoads(0, 0, a, 1.0, np.arange(101))])
+    found = pressed(state, [ArmLoads(0, 0, a, 1.0, t)])
     assert [t[one.instant] for one in found] == pytest.approx([0.63], abs=0.011)
     assert found[0].modes.inverse[0] == pytest.approx(1.0 / factor_of(state, FORCE, size.min()))
     # Twice as stiff under the same stress: half as near to buckling.
-    (stiffer,) = pressed(state, [ArmLoads(0, 0, a, 2.0, np.arange(101))])
+    (stiffer,) = pressed(state, [ArmLoads(0, 0, a, 2.0, t)])
     assert stiffer.modes.inverse[0] == pytest.approx(0.5 * found[0].modes.inverse[0])
 
 
@@ -140,7 +140,7 @@ def test_member_that_weaker_loads_press_is_found():
     t = np.linspace(0.01, 0.99, 50)
     size = np.sin(5.0 * np.pi * t) ** 2 * np.where((t > 0.4) & (t < 0.6), -0.5, 1.0)
     a = 100.0 * size[:, None] * under(arm.current, ACROSS, 1.0).a
-    found = pressed(arm.current, [ArmLoads(0, 0, a, 1.0, np.arange(50))])
+    found = pressed(arm.current, [ArmLoads(0, 0, a, 1.0, t)])
     every = [1.0 / factor_of(arm.current, ACROSS, 100.0 * item) for item in size]
     assert found[0].modes.inverse[0] == pytest.approx(max(every))
 
