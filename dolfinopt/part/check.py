@@ -219,7 +219,7 @@ def _with_buckling(simulated: Simulated, larger: Simulated | None, column: Colum
     """Return the figures of plates with the lowest buckling factor."""
     if BUCKLING not in column.values:
         return column
-    # Larger cells tell which arm buckles first, and when.
+    # Larger cells tell which arm buckles first.
     known = None if larger is None else lowest_buckling(larger.arms, larger.trajectory)
     result = lowest_buckling(simulated.arms, simulated.trajectory, known)
     factor = float("nan") if result is None else result.factor

@@ -64,7 +64,7 @@ def _with_more(
         if not down.any():
             u[at] = best
             return u
-        way = np.min(u[at][down] / (u[at] - best)[down])
+        way = np.min(u[at][down] / np.maximum(u[at] - best, ROUNDING)[down])  # both may be zero
         u[at] += way * (best - u[at])
         gone = at[down & (u[at] <= ROUNDING)]
         u[gone], free[gone] = 0.0, False

@@ -33,7 +33,7 @@ FOLLOWED = 6  # steps that a mesh follows
 # its limit, which a step mends: by that mesh lightest arms ended after 18 steps at 1.036 kg, by
 # this one after 48 at 1.030. With 1e-2 a SCARA's parts end at 0.505 kg, with this at 0.503.
 SETTLED = 5e-3
-MOST, OLD = 6, 5  # places that are differentiated in a step; steps that their rows hold
+MOST, OLD = 20, 5  # places that are differentiated in a step; steps that their rows hold
 ATTEMPTS, ENOUGH = 3, 0.3  # at a step of one radius; of the promised fall, that ends them
 # Of each limit over the objective: first; least; over the multiplier. One price for all refuses
 # steps for the stress that cost the deviation alone: lightest arms after 18 steps 1.048 kg for
@@ -41,7 +41,7 @@ ATTEMPTS, ENOUGH = 3, 0.3  # at a step of one radius; of the promised fall, that
 PRICE, LEAST_PRICE, OVER = 1.5, 0.5, 3.0
 # Price of limits that shall be met above all; steps to that, at most; trust region of the first,
 # and of the first on a new mesh after no step bettered the parts.
-DEAR, RESTORING, NEARBY = 50.0, 3, 0.1
+DEAR, RESTORING, NEARBY = 50.0, 6, 0.1
 FALLS = 0.95  # what is left of a missed limit after a step, above which its price doubles
 # Of the promised fall: what a step must bring, and what makes the next one shorter, or longer.
 ACCEPTED, POOR, GOOD = 0.05, 0.25, 0.6
@@ -118,7 +118,10 @@ class Search:
                 settled = self._settled()
                 self._simplified()
                 if settled:
-                    return "settled"
+                    tied = {k: item.tied() for k, item in self.state.outlines.items()}
+                    if tied == self.state.outlines:
+                        return "settled"
+                    self.state = replace(self.state, outlines=tied)
                 self._mesh_anew()
             if self._step():
                 tell(self._line())
@@ -239,8 +242,7 @@ class Search:
                 y = y + price * (self.rows[key][0] - old.stress[key])
         s = step.total
         if self.curvature is None:  # at first a multiple of one
-            least = 0.05 * np.linalg.norm(s) * np.linalg.norm(y)
-            scale = max(float(s @ y), float(least)) / float(s @ s)
+            scale = float(np.linalg.norm(y) / np.linalg.norm(s))
             self.curvature = BFGS("damp_update", init_scale=scale)
             self.curvature.initialize(len(s), "hess")
         self.curvature.update(s, y)
@@ -267,13 +269,12 @@ class Search:
                 break
             tries.append(step)
             after = step.state.places
-            missed = max(EXCESS, 0.4 * max(after.values(), default=0.0))
             unknown = [
                 key
                 for key in sorted(after, key=lambda k: -after[k])
                 if key in state.places
                 and (key not in linear.stress or self.rows[key][1] < self.steps)
-                and after[key] > missed
+                and after[key] > EXCESS
             ]
             if step.fall >= ENOUGH * step.promised or not unknown:
                 break

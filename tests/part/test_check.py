@@ -55,7 +55,7 @@ def test_part_is_converged_and_says_what_it_loses(made):
     assert abs(check.refinement["stress"]) < 0.15
     change = 100.0 * (check.part.values["compliance"] / check.density.values["compliance"] - 1.0)
     assert f"{abs(change):.2g} % {'stiffer' if change < 0 else 'softer'}" in check.loss
-    assert "deviation" in check.loss and len(check.loss.splitlines()) == 1
+    assert "deviation" in check.loss and "\n" not in check.loss
 
 
 def test_part_without_a_coarse_mesh_tells_that_its_error_is_not_known(made):
@@ -83,7 +83,7 @@ def test_buckling_of_the_part_stands_in_the_table(made):
     weak = replace(check.part, buckling=LeastBuckling(1.2345, 0, 0.5))
     (warning,) = [text for text in replace(check, part=weak).warnings if "buckles" in text]
     assert warning.startswith("arm1 buckles at 1.23 times its loads at 0.500 s")
-    assert len(warning.splitlines()) == 1
+    assert "\n" not in warning
 
 
 def test_model_checks_parts_of_a_design(made):

@@ -15,7 +15,7 @@ from dolfinopt.part.plane.limits import Limits
 from dolfinopt.part.plane.part import make_part
 from dolfinopt.part.plane.sides import Circle, Corner, Loop, Side, Sides
 from dolfinopt.part.plane.struts import with_struts
-from dolfinopt.part.program import least_move, solve
+from dolfinopt.part.program import _with_more, least_move, solve
 
 pytestmark = pytest.mark.serial
 
@@ -143,11 +143,14 @@ def test_nearest_outline_keeps_the_limits_and_an_area():
 
 def test_shortest_move_is_that_of_the_book():
     """The foot of the origin on x + y >= 2 and x >= 1.5."""
-    A, b = np.array([[-1.0, -1.0], [-1.0, 0.0]]), np.array([-2e-3, -1.5e-3])
+    A, b = np.array([[-1.0, -1.0], [-1.0, 0.0]]), -np.array([2e-3, 1.5e-3])
     x, dual = least_move(A, b, 1e-3)
     np.testing.assert_allclose(x, [1.5e-3, 5e-4], atol=1e-12)
     np.testing.assert_allclose(-dual @ A, x, atol=1e-12)
-    assert least_move(np.array([[1.0], [-1.0]]), np.array([-1e-3, -1e-3]), 1e-3) is None
+    assert least_move(np.array([[1.0], [-1.0]]), np.full(2, -1e-3), 1e-3) is None
+    # Of two columns at a time the second one may bring exactly nothing.
+    both = np.eye(2)
+    assert _with_more(both, both[0], both, 0 * b, [0, 1])[0] == 1.0
 
 
 def test_quadratic_programme_keeps_its_conditions():

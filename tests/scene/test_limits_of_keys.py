@@ -132,7 +132,7 @@ def test_a_number_at_its_limit_runs_or_is_refused_in_one_line(machine, key, valu
         else:
             run([*USED.get(key, []), f"{key}={toml(value, allowed)}"])
     except (InputError, ConvergenceError) as error:
-        assert len(str(error).splitlines()) == 1
+        assert "\n" not in str(error)
 
 
 def test_loads_and_weights_at_their_limits():

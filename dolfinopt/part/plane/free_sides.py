@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -16,11 +17,13 @@ from dolfinopt.part.plane.curves import Line, angle_of, left, unit
 from dolfinopt.part.plane.limits import Limits, rounded_radii
 from dolfinopt.part.plane.part import PlanePart
 from dolfinopt.part.plane.sides import (
+    BrokenError,
     Loop,
     Side,
     Sides,
 )
 from dolfinopt.part.plane.simpler import simplifications
+from dolfinopt.part.plane.struts import with_struts
 from dolfinopt.part.solid.part import SolidPart, plate_part
 
 # Shape of a triangle, 1 where it is equilateral, below which a new mesh is due, and over the worst.
@@ -84,6 +87,14 @@ class FreeSides:
                     break
             else:
                 return result[1:]
+
+    def tied(self) -> FreeSides:
+        """Return it with the sides of all struts tied, if there are more of them than before."""
+        with suppress(BrokenError):
+            near = replace(self, sides=with_struts(self.sides)).nearest()
+            if near is not None and near[0].count < self.count:
+                return near[0]
+        return self
 
     def moved(self, x: np.ndarray) -> FreeSides:
         """Return it after a step x.

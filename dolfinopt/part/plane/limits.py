@@ -250,7 +250,7 @@ def rounded_radii(sides: Sides, limits: Limits) -> Sides:
     circles = tuple(replace(circle, radius=rounded(circle.radius)) for circle in sides.circles)
     even = replace(even, circles=circles, holds_radii=True)
     result = limits.nearest(even, area=sides.shape.area) or limits.nearest(even)
-    return sides if result is None else replace(result[0], holds_radii=False)
+    return replace((result or (sides,))[0], holds_radii=False)
 
 
 def with_radii(sides: Sides, of: Callable[[float], float]) -> Sides:

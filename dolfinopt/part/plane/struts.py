@@ -26,8 +26,9 @@ def with_struts(sides: Sides) -> Sides:
     Raises:
         BrokenError: they do not close then.
     """
-    moving = [item for item in sides.placed if item.piece.free]
-    lines = [item for item in moving if isinstance(item.piece.curve, Line)]
+    lines = [
+        item for item in sides.placed if item.piece.free and isinstance(item.piece.curve, Line)
+    ]
     if not lines:
         return sides
     ends = np.array([(item.piece.curve.start, item.piece.curve.end) for item in lines])
