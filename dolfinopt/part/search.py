@@ -117,15 +117,12 @@ class Search:
             if self.since >= FOLLOWED:
                 settled = self._settled()
                 self._simplified()
-                if settled:
-                    tied = {k: item.tied() for k, item in self.state.outlines.items()}
-                    if tied == self.state.outlines:
-                        return "settled"
-                    self.state = replace(self.state, outlines=tied)
+                if settled and not self._tied():
+                    return "settled"
                 self._mesh_anew()
             if self._step():
                 tell(self._line())
-            elif self.since > 0:
+            elif self.since > 0 or self._tied():
                 self.since, self.radius = FOLLOWED, max(self.radius, NEARBY)
             else:
                 return "no step betters the parts"
@@ -151,6 +148,12 @@ class Search:
             self.problem, self.state = self.problem.calibrated(before)
             self.radius *= 0.5
         self.since, self.before, self.meshed = 0, None, self.state.outlines
+
+    def _tied(self) -> bool:
+        """Tie the sides of struts that have come to be; return whether there are any."""
+        tied = {k: item.tied() for k, item in self.state.outlines.items()}
+        before, self.state = self.state, replace(self.state, outlines=tied)
+        return tied != before.outlines
 
     def _simplified(self) -> None:
         """Go on without sides that have vanished and holes that close, if that costs little."""

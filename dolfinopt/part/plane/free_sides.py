@@ -82,7 +82,7 @@ class FreeSides:
             last = result[-1]
             for sides in simplifications(last.sides, self.limits, self.part.domain.outer_edges):
                 near = replace(last, sides=sides).nearest()
-                if near is not None and 0 < near[0].count < last.count:
+                if near and 0 < near[0].count < last.count:
                     result.append(near[0])
                     break
             else:
@@ -92,7 +92,7 @@ class FreeSides:
         """Return it with the sides of all struts tied, if there are more of them than before."""
         with suppress(BrokenError):
             near = replace(self, sides=with_struts(self.sides)).nearest()
-            if near is not None and near[0].count < self.count:
+            if near and near[0].count < self.count:
                 return near[0]
         return self
 

@@ -31,8 +31,7 @@ def with_struts(sides: Sides) -> Sides:
     ]
     if not lines:
         return sides
-    ends = np.array([(item.piece.curve.start, item.piece.curve.end) for item in lines])
-    ends = ends @ [1.0, 1.0j]
+    ends = np.array([item.piece.curve.at(np.arange(2.0)) for item in lines]) @ [1.0, 1.0j]
     way = ends[:, 1:] - ends[:, :1]
     length = np.abs(way)
     seen = (ends - ends[:, None, :1]) * (way.conj() / length)[..., None]  # along each, to its left
@@ -41,9 +40,8 @@ def with_struts(sides: Sides) -> Sides:
     faces = (width > 0.0) & (shared > np.maximum(width, 0.5 * length))
     width = np.where(faces & faces.T & (np.abs(angle) < ALMOST), width, np.inf)
     nearest = np.isfinite(width) & (width <= width.min(axis=1, keepdims=True))
-    _, first, strut = np.unique(
-        connected_components(nearest)[1], return_index=True, return_inverse=True
-    )
+    strut = connected_components(nearest)[1]
+    first = np.unique(strut, return_index=True)[1]
     # Opposite directions have the same square: the mean one by lengths.
     mean = np.zeros(len(first), dtype=complex)
     np.add.at(mean, strut, (way**2 / length)[:, 0])
