@@ -219,8 +219,8 @@ class Search:
     def _take(self, state: State, step: Step, linear: Linear) -> None:
         dual = np.append(step.multipliers, sum(step.places.values())) / abs(state.values[0])
         # A price far above the multiplier makes steps short.
-        lower = np.clip(np.maximum(OVER * dual, 0.7 * self.prices), LEAST_PRICE, self.prices)
-        self.prices = np.where(dual < 0.5 * self.prices, lower, self.prices)
+        lower = np.maximum(OVER * dual, 0.7 * self.prices)
+        self.prices = np.clip(lower, LEAST_PRICE, self.prices)
         low = step.state.values[1:] > np.maximum(5.0 * EXCESS, FALLS * state.values[1:])
         self.prices[low] *= 2.0
         self.before = None if step.anew else (step, linear)

@@ -282,7 +282,7 @@ class _Pen:
     limits: Limits
     names: Iterator[int]
 
-    def radius(self, _: Side, place: np.ndarray, half: float) -> float:
+    def radius(self, _: Any, place: np.ndarray, half: float) -> float:
         """Return the radius of a fillet that touches the outline."""
         import shapely
 
@@ -519,7 +519,7 @@ def looped(
     drawn: Sequence[Drawn],
     limits: Limits,
     outer: int,
-    radius_at: Callable[[Side, np.ndarray, float], float],
+    radius_at: Callable[[tuple[int, int], np.ndarray, float], float],
 ) -> Loop:
     """Return a loop of sides with fillets at its concave corners.
 
@@ -527,8 +527,8 @@ def looped(
         drawn: the sides.
         limits: of the part; radii are within them, and leave room on the sides.
         outer: number of the arm's own curves.
-        radius_at: returns the wanted radius, m, of the corner before this side, at this place (2,),
-            half of whose turn is this angle.
+        radius_at: returns the wanted radius, m, of the corner between the sides of two keys, at
+            this place (2,), half of whose turn is this angle.
     """
     places, turns = _vertices(drawn)
     corners = []
@@ -540,7 +540,9 @@ def looped(
         half = _half(turn)
         ends = (places[k - 1], places[(k + 1) % len(places)])
         room = 0.5 * min(float(np.linalg.norm(end - place)) for end in ends) / np.tan(half)
-        radius = max(min(radius_at(b, place, half), room), limits.tool, SHORT * limits.cell)
+        radius = max(
+            min(radius_at((a.key, b.key), place, half), room), limits.tool, SHORT * limits.cell
+        )
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
         near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)
         corners.append(Corner(near, radius))

@@ -66,11 +66,11 @@ def _drawn(sides: Sides, i: int) -> list[Drawn]:
 
 def _without(sides: Sides, gone: set[int], limits: Limits, outer: int) -> Iterator[Sides]:
     """Yield the outline without sides of some keys."""
+    # By both sides of a corner: mirror images have them the other way round.
     radii = {
-        side.key: corner.radius
+        (before.key, side.key): corner.radius
         for loop in sides.loops
-        for side, corner in zip(loop.sides, loop.corners, strict=True)
-        if corner.radius > 0.0
+        for before, side, corner in zip(loop.sides[-1:] + loop.sides, loop.sides, loop.corners)
     }
     loops = []
     for i, loop in enumerate(sides.loops):
@@ -78,6 +78,6 @@ def _without(sides: Sides, gone: set[int], limits: Limits, outer: int) -> Iterat
             kept = cleaned(without(_drawn(sides, i), gone), limits)
             if len(kept) < 3:
                 return
-            loop = looped(kept, limits, outer, lambda side, *_: radii.get(side.key, limits.tool))
+            loop = looped(kept, limits, outer, lambda pair, *_: radii.get(pair, 0.0))
         loops.append(loop)
     yield replace(sides, loops=tuple(loops))
