@@ -34,7 +34,7 @@ from dolfinopt.scene.load import Scene
 if TYPE_CHECKING:
     from dolfinopt.part.part import Part
 
-REPAIRS = 3  # times that limits missed in the end are met by further steps
+REPAIRS = 5  # times that limits missed in the end are met by further steps
 TRUSSES = "trusses"  # what the names of starts that are no densities begin with
 
 Outlines = Mapping[int, FreeSides]

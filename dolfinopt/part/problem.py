@@ -15,7 +15,7 @@ from dolfinopt.part.check import STRESS, Simulated, simulate_parts
 from dolfinopt.part.mesh import PlateMesh
 from dolfinopt.part.plane.free_sides import FreeSides
 from dolfinopt.part.stress import HOT, CornerStress, OutlineStress
-from dolfinopt.responses.constraints import EXCESS, Limit, limits_of
+from dolfinopt.responses.constraints import Limit, limits_of
 from dolfinopt.responses.evaluation import constraint_gradients, objective_gradient
 from dolfinopt.responses.response import objective_of
 from dolfinopt.responses.stress import arm_loads, maxima, motions_of
@@ -231,10 +231,10 @@ class Problem:
         return replace(plain, local=local), replace(fresh, places=places)
 
     def tighter(self, missed: Sequence[Limit]) -> Problem:
-        """Return the problem with limits that are tighter by what finer meshes miss."""
+        """Return the problem with limits that are tighter by twice what finer meshes miss."""
         # Lower limits count by their squares, as those of frequencies.
         tightened = {
-            item.name: self._factor(item) * (1.0 + item.excess + EXCESS) ** (2 if item.least else 1)
+            item.name: self._factor(item) * (1.0 + 2.0 * item.excess) ** (2 if item.least else 1)
             for item in missed
         }
         return replace(self, tightened={**self.tightened, **tightened})
