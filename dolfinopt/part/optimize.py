@@ -326,8 +326,8 @@ class Descent:
         """
         missed = [limit for limit in limits if not limit.met]
         self.tell("tightened by what finer meshes show: " + ", ".join(item.name for item in missed))
-        problem = self.search.problem.tighter(missed)
-        self.search = Search(problem, self.search.state, self.search.steps)
+        search = self.search
+        self.search = Search(search.problem.tighter(missed), search.state, search.steps)
 
         def met() -> bool:
             result = self._judged(start, self.search.state.outlines, self.search.meshed)

@@ -286,7 +286,10 @@ class _Pen:
         """Return the radius of a fillet that touches the outline."""
         import shapely
 
-        gap = shapely.distance(shapely.Point(place), self.outline.polygon.boundary)
+        x, y = place
+        if self.outline.domain.symmetric:  # the polygon is to a hundredth of a millimetre
+            y = abs(y)
+        gap = shapely.distance(shapely.Point(x, y), self.outline.polygon.boundary)
         return float(gap / (1.0 / np.cos(half) - 1.0))
 
     def drawn(self, contour: _Contour, tolerance: float) -> Sides | None:
@@ -544,6 +547,6 @@ def looped(
             min(radius_at((a.key, b.key), place, half), room), limits.tool, SHORT * limits.cell
         )
         out = -left(a.foot(place)[1]) - left(b.foot(place)[1])
-        near = place + radius / np.cos(half) * out / max(float(np.linalg.norm(out)), 1e-9)
+        near = place + radius / np.cos(half) * out / max(np.linalg.norm(out), 1e-9)
         corners.append(Corner(near, radius))
     return Loop(tuple(item.side for item in drawn), tuple(corners))

@@ -72,8 +72,9 @@ class FreeSides:
 
     def drawn(self) -> FreeSides:
         """Return it with radii of whole half millimetres, if they are asked for."""
-        rounds = self.part.rounds
-        return replace(self, sides=rounded_radii(self.sides, self.limits)) if rounds else self
+        if not self.part.rounds:
+            return self
+        return replace(self, sides=rounded_radii(self.sides, self.limits))
 
     def simpler(self) -> list[FreeSides]:
         """Return it without what its limits hold at its least, every one without a thing more."""

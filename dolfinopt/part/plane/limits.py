@@ -184,8 +184,7 @@ class Limits:
                     g, margin = np.append(g, missing), np.append(margin, [0.0, 0.0])
                     A = np.vstack([A, np.outer([-1.0, 1.0], slope / mean)])
                 if g.max(initial=-1.0) < KEPT:
-                    simple = sides.shape.is_simple(CHORD * self.cell)
-                    return (sides, total) if simple else None
+                    return (sides, total) if sides.shape.is_simple(CHORD * self.cell) else None
                 some = g > -FAR * self.cell
                 result = least_move(A[some], -g[some] - margin[some], self.cell)
                 if result is None or (size := np.abs(result[0]).max()) > 6.0 * FAR * self.cell:

@@ -45,7 +45,10 @@ def with_struts(sides: Sides) -> Sides:
     # Opposite directions have the same square: the mean one by lengths.
     mean = np.zeros(len(first), dtype=complex)
     np.add.at(mean, strut, (way**2 / length)[:, 0])
-    q, at = np.zeros(sides.numbers[0]), [sides.numbers[1][item.loop, item.side] for item in lines]
-    q[np.add(at, 1)] = 0.5 * np.angle(mean[strut] / way[:, 0] ** 2)
+    count, of_sides, _ = sides.numbers
+    q = np.zeros(count)
+    q[[of_sides[item.loop, item.side] + 1 for item in lines]] = 0.5 * np.angle(
+        mean[strut] / way[:, 0] ** 2
+    )
     keys = [sides.loops[item.loop].sides[item.side].key for item in lines]
     return replace(sides.moved(q), struts={key: keys[first[n]] for key, n in zip(keys, strut)})
