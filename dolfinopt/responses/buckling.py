@@ -150,8 +150,7 @@ class Buckling(Response):
     """p-norm of 1 / factor over arms, their worst instants and modes; true: the factor.
 
     Instants are peaks over the times of all scenarios, up to three of every arm, of each the four
-    lowest modes. That
-    nothing buckles is a factor of 1000, and of no influence.
+    lowest modes. That nothing buckles is a factor of 1000, and of no influence.
     """
 
     def measure(self, analysis: Analysis) -> Measured:

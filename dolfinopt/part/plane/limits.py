@@ -2,7 +2,7 @@
 
 Every limit is a row g + A x <= 0 with closed-form derivatives. Widths are measured from places
 along the outline to the exact nearest point of every other piece; of a pair of pieces the least
-counts. Both sides of a strut are parallel. The nearest outline that keeps all rows is found by a
+counts. The nearest outline that keeps all rows is found by a
 few of Newton's steps, each the shortest x with A x <= -g.
 """
 

@@ -1,7 +1,7 @@
 """Which sides are those of one strut: they stay parallel, as they turn together.
 
-That is decided once, when an outline is fitted. A search that decides it at every step turns sides
-by degrees as soon as they face each other, and ends there: feed_forward.toml at 0.485 kg.
+That is decided when an outline is fitted, and again where its search settles. Decided at every
+step it turns sides by degrees as soon as they face each other: 18 % of stress in a strut of 1 mm.
 """
 
 from __future__ import annotations
