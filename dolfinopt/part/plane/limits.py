@@ -2,8 +2,8 @@
 
 Every limit is a row g + A x <= 0 with closed-form derivatives. Widths are measured from places
 along the outline to the exact nearest point of every other piece; of a pair of pieces the least
-counts. The nearest outline that keeps all rows is found by a
-few of Newton's steps, each the shortest x with A x <= -g.
+counts. The nearest outline that keeps all rows is found by a few of Newton's steps, each the
+shortest x with A x <= -g.
 """
 
 from __future__ import annotations
